@@ -1,0 +1,1 @@
+"""The Cosserat rod: physics only, no reinforcement learning."""

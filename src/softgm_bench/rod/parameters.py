@@ -1,0 +1,169 @@
+"""The arm's physical parameters and the constants of the discretised rod derived from them."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+DAMPING_PROTOCOLS = ("damping_constant", "uniform_damping_constant")
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RodParameters:
+    """One uniform Cosserat rod with a clamped base, in SI units. The defaults are the paper's arm.
+
+    ``damping_protocol`` names the form of PyElastica's ``AnalyticalLinearDamper`` that receives ``damping_constant``.
+    One control step is ``substeps`` position-Verlet steps of ``dt`` seconds.
+    """
+
+    n_elements: int = 60
+    base_length: float = 1.0
+    base_radius: float = 0.05
+    density: float = 1000.0
+    youngs_modulus: float = 5e5
+    shear_modulus: float = 2e5
+    gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    damping_protocol: str = "damping_constant"
+    damping_constant: float = 0.3
+    contact_stiffness: float = 5e4
+    contact_damping: float = 50.0
+    friction_coefficient: float = 0.0
+    velocity_damping_coefficient: float = 0.0
+    dt: float = 4e-4
+    substeps: int = 100
+
+    def __post_init__(self) -> None:
+        """Refuse parameters that describe no rod.
+
+        Raises:
+            ValueError: with one line naming the field, its value and what would be right.
+        """
+        if self.n_elements < 2:
+            raise ValueError(f"rod.n_elements is {self.n_elements}: a rod needs at least 2 elements")
+        if self.substeps < 1:
+            raise ValueError(f"rod.substeps is {self.substeps}: a control step needs at least 1 substep")
+        positive = ("base_length", "base_radius", "density", "youngs_modulus", "shear_modulus", "dt")
+        for name in positive:
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"rod.{name} is {getattr(self, name)}: it must be above 0")
+        not_negative = (
+            "damping_constant",
+            "contact_stiffness",
+            "contact_damping",
+            "friction_coefficient",
+            "velocity_damping_coefficient",
+        )
+        for name in not_negative:
+            if not getattr(self, name) >= 0.0:
+                raise ValueError(f"rod.{name} is {getattr(self, name)}: it must not be negative")
+        if len(self.gravity) != 3:
+            raise ValueError(f"rod.gravity is {self.gravity}: it must have 3 components")
+        if self.damping_protocol not in DAMPING_PROTOCOLS:
+            raise ValueError(
+                f"rod.damping_protocol is {self.damping_protocol!r}: choose one of {', '.join(DAMPING_PROTOCOLS)}"
+            )
+
+    @property
+    def n_nodes(self) -> int:
+        """Number of nodes, one more than elements."""
+        return self.n_elements + 1
+
+    @property
+    def control_dt(self) -> float:
+        """Duration of one control step in seconds."""
+        return self.dt * self.substeps
+
+
+class RodConstants(NamedTuple):
+    """Constants of the discretised rod, float64. Matrices that are diagonal are kept as their diagonals.
+
+    Attributes:
+        position: nodes at rest, ``(3, n_nodes)``.
+        director: rows d1, d2, d3 of every element at rest, ``(3, 3, n_elements)``.
+        rest_length: ``(n_elements,)``.
+        rest_voronoi_length: ``(n_elements - 1,)``.
+        volume: of each element, conserved, ``(n_elements,)``.
+        mass: of each node, half at the ends, ``(n_nodes,)``.
+        inertia: mass second moment of inertia, ``(3, n_elements)``.
+        shear: shear/stretch stiffness, ``(3, n_elements)``.
+        bend: bend/twist stiffness, Voronoi-averaged, ``(3, n_elements - 1)``.
+        translational_decay: factor on every node's velocity per substep.
+        rotational_decay_rate: the angular velocity's factor per substep is ``exp(-rate * e)`` with e the element's
+            dilatation, or ``exp(-rate)`` where the protocol does not depend on it; ``(3, n_elements)``.
+        decay_follows_dilatation: whether the factor above uses e.
+    """
+
+    position: Array
+    director: Array
+    rest_length: Array
+    rest_voronoi_length: Array
+    volume: Array
+    mass: Array
+    inertia: Array
+    shear: Array
+    bend: Array
+    translational_decay: float
+    rotational_decay_rate: Array
+    decay_follows_dilatation: bool
+
+
+def rod_constants(parameters: RodParameters) -> RodConstants:
+    """Discretise the rod as PyElastica 1.0.0 does: along +z from the origin, d1 = +y, no rest strain."""
+    n = parameters.n_elements
+    position = np.zeros((3, n + 1))
+    position[2] = np.linspace(0.0, parameters.base_length, n + 1)
+    rest_length = np.diff(position[2])
+
+    director = np.zeros((3, 3, n))
+    director[0, 1] = 1.0  # d1 = +y
+    director[1, 0] = -1.0  # d2 = d3 x d1 = -x
+    director[2, 2] = 1.0  # d3 = +z
+
+    area = np.pi * parameters.base_radius**2
+    second_moment = area**2 / (4.0 * np.pi) * np.array([1.0, 1.0, 2.0])
+    inertia = second_moment[:, None] * parameters.density * rest_length
+    shear_correction = 27.0 / 28.0
+    moduli = np.array(
+        [
+            shear_correction * parameters.shear_modulus,
+            shear_correction * parameters.shear_modulus,
+            parameters.youngs_modulus,
+        ]
+    )
+    shear = np.repeat((moduli * area)[:, None], n, axis=1)
+    bend_moduli = np.array([parameters.youngs_modulus, parameters.youngs_modulus, parameters.shear_modulus])
+    bend = np.repeat((bend_moduli * second_moment)[:, None], n, axis=1)
+    bend = (bend[:, 1:] * rest_length[1:] + bend[:, :-1] * rest_length[:-1]) / (rest_length[1:] + rest_length[:-1])
+
+    volume = area * rest_length
+    mass = np.zeros(n + 1)
+    mass[:-1] += 0.5 * parameters.density * volume
+    mass[1:] += 0.5 * parameters.density * volume
+
+    decay = parameters.damping_constant * parameters.dt
+    follows = parameters.damping_protocol == "damping_constant"
+    if follows:
+        element_mass = 0.5 * (mass[1:] + mass[:-1])
+        element_mass[0] += 0.5 * mass[0]
+        element_mass[-1] += 0.5 * mass[-1]
+        rate = decay * element_mass / inertia
+    else:
+        rate = np.full((3, n), decay)
+
+    return RodConstants(
+        position=position,
+        director=director,
+        rest_length=rest_length,
+        rest_voronoi_length=0.5 * (rest_length[1:] + rest_length[:-1]),
+        volume=volume,
+        mass=mass,
+        inertia=inertia,
+        shear=shear,
+        bend=bend,
+        translational_decay=float(np.exp(-decay)),
+        rotational_decay_rate=rate,
+        decay_follows_dilatation=follows,
+    )

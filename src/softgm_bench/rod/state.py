@@ -1,0 +1,70 @@
+"""What moves (the rod's state) and what it may touch (cylinders), batched over environments."""
+
+import torch
+from tensordict import TensorClass
+from torch import Tensor
+
+from softgm_bench.rod.parameters import RodParameters, rod_constants
+
+
+class RodState(TensorClass):
+    """Kinematic state of ``num_envs`` rods; ``batch_size`` is ``(num_envs,)``.
+
+    Attributes:
+        position: nodes in the world frame, m, ``(num_envs, 3, n_nodes)``.
+        director: rows d1, d2, d3 of each element's material frame, ``(num_envs, 3, 3, n_elements)``.
+        velocity: of nodes in the world frame, m/s, ``(num_envs, 3, n_nodes)``.
+        omega: angular velocity in the material frame, rad/s, ``(num_envs, 3, n_elements)``.
+    """
+
+    position: Tensor
+    director: Tensor
+    velocity: Tensor
+    omega: Tensor
+
+
+class Cylinders(TensorClass):
+    """Fixed rigid cylinders, padded to a common number per environment; ``batch_size`` is ``(num_envs,)``.
+
+    Attributes:
+        start: centre of one end, m, ``(num_envs, n_cylinders, 3)``.
+        axis: unit vector from start to the other end, ``(num_envs, n_cylinders, 3)``.
+        length: m, ``(num_envs, n_cylinders)``; positive also where masked.
+        radius: m, ``(num_envs, n_cylinders)``.
+        mask: whether the cylinder exists, ``(num_envs, n_cylinders)``.
+    """
+
+    start: Tensor
+    axis: Tensor
+    length: Tensor
+    radius: Tensor
+    mask: Tensor
+
+
+def straight_rods(
+    parameters: RodParameters,
+    num_envs: int,
+    dtype: torch.dtype = torch.float64,
+    device: torch.device | str = "cpu",
+) -> RodState:
+    """Rods at rest: straight along +z from the origin with d1 = +y (SPEC section 1)."""
+    constants = rod_constants(parameters)
+
+    def repeat(array) -> Tensor:
+        tensor = torch.as_tensor(array, dtype=dtype, device=device)
+        return tensor.expand(num_envs, *tensor.shape).clone()
+
+    position, director = repeat(constants.position), repeat(constants.director)
+    return RodState(
+        position=position,
+        director=director,
+        velocity=torch.zeros_like(position),
+        omega=torch.zeros_like(director[:, 0]),
+        batch_size=[num_envs],
+    )
+
+
+def dilatation(position: Tensor, rest_length: Tensor) -> Tensor:
+    """Element lengths over rest lengths (Gazzola et al. 2018, eq. 3.3): ``(num_envs, n_elements)``."""
+    edges = position[..., 1:] - position[..., :-1]
+    return edges.norm(dim=-2) / rest_length
