@@ -1,0 +1,231 @@
+"""Contact between rods and fixed cylinders: PyElastica's penalty forces, and the geometric test of who touches.
+
+Vectors over elements keep PyElastica's layout, components before elements. A pair (cylinder, element) adds one
+dimension in front: ``(num_envs, n_cylinders, 3, n_elements)``. Everything is elementwise over environments, and the
+sum over cylinders is a fixed tree, so that no environment's result depends on its neighbours in the batch by even a bit.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+from softgm_bench.rod.parameters import RodParameters
+from softgm_bench.rod.state import Cylinders
+
+# |sin| of the angle between two axes below which PyElastica treats them as parallel, squared.
+_PARALLEL = 1e-6
+
+
+def element_length(position: Tensor) -> Tensor:
+    """Current lengths ``(..., n_elements)`` of nodes ``(..., 3, n_nodes)``, with PyElastica's guard of 1e-14 m."""
+    return safe_norm(position[..., 1:] - position[..., :-1]) + 1e-14
+
+
+def element_radius(position: Tensor, volume: Tensor) -> Tensor:
+    """Current radii of incompressible elements (Gazzola et al. 2018, section 2.3).
+
+    Args:
+        position: ``(num_envs, 3, n_nodes)``.
+        volume: ``(n_elements,)``, conserved.
+
+    Returns:
+        ``(num_envs, n_elements)``.
+    """
+    return (volume / element_length(position) / math.pi).sqrt()
+
+
+def safe_norm(vector: Tensor, dim: int = -2) -> Tensor:
+    """Euclidean norm along ``dim`` whose gradient at the zero vector is zero instead of NaN."""
+    square = (vector * vector).sum(dim)
+    positive = square > 0.0
+    return torch.where(positive, torch.where(positive, square, 1.0).sqrt(), square)  # the last keeps 0 and NaN
+
+
+def contact_forces(
+    position: Tensor, velocity: Tensor, radius: Tensor, cylinders: Cylinders, parameters: RodParameters
+) -> Tensor:
+    """Forces of fixed cylinders on the rods' nodes, as PyElastica's ``_calculate_contact_forces_rod_cylinder``.
+
+    Its quirks are kept: an element's segment starts at the element's midpoint and has its full edge, and the first and
+    last elements split their force 2/3 : 4/3 between end and inner node. Its bounding-box pruning, which misses
+    contacts, is not: every pair is computed.
+
+    Args:
+        position: ``(num_envs, 3, n_nodes)``.
+        velocity: ``(num_envs, 3, n_nodes)``.
+        radius: current radii, ``(num_envs, n_elements)``.
+        cylinders: of the same ``num_envs``; values of masked ones are never read.
+        parameters: stiffness, damping and friction.
+
+    Returns:
+        ``(num_envs, 3, n_nodes)`` in the world frame.
+    """
+    if cylinders.mask.shape[1] == 0:
+        return torch.zeros_like(position)
+    cylinder_start, cylinder_edge, cylinder_radius = _existing(cylinders)
+    centre = 0.5 * (position[:, None, :, 1:] + position[:, None, :, :-1])
+    edge = position[:, None, :, 1:] - position[:, None, :, :-1]
+    # Relative velocity of the cylinder, which is at rest, seen from the element.
+    approach = -0.5 * (velocity[:, None, :, 1:] + velocity[:, None, :, :-1])
+
+    gap = shortest_connection(centre, edge, cylinder_start, cylinder_edge)
+    distance = safe_norm(gap)
+    penetration = radius[:, None] + cylinder_radius - distance
+    touching = cylinders.mask[:, :, None] & (penetration > 0.0)
+    force = _pair_forces(gap, distance, penetration, approach, touching, parameters)
+    return -_elements_to_nodes(_tree_sum(force))
+
+
+def contact_nodes(position: Tensor, radius: Tensor, cylinders: Cylinders) -> Tensor:
+    """Which nodes touch a cylinder: geometric, independent of the force model.
+
+    A node touches where its distance to the axis segment of an existing cylinder is below the sum of the radii. A
+    node's radius is the mean of its elements'.
+
+    Args:
+        position: ``(num_envs, 3, n_nodes)``.
+        radius: current radii of the elements, ``(num_envs, n_elements)``.
+        cylinders: of the same ``num_envs``.
+
+    Returns:
+        bool, ``(num_envs, n_nodes)``.
+    """
+    node_radius = 0.5 * (
+        torch.cat([radius[:, :1], radius], dim=-1) + torch.cat([radius, radius[:, -1:]], dim=-1)
+    )  # (num_envs, n_nodes); the end nodes count their one element twice
+    distance = point_segment_distance(
+        position.transpose(-1, -2)[:, None],
+        cylinders.start[:, :, None],
+        cylinders.axis[:, :, None],
+        cylinders.length[:, :, None],
+    )
+    touches = distance < node_radius[:, None] + cylinders.radius[:, :, None]
+    return (touches & cylinders.mask[:, :, None]).any(dim=1)
+
+
+def point_segment_distance(point: Tensor, start: Tensor, axis: Tensor, length: Tensor) -> Tensor:
+    """Distance of points to segments.
+
+    Args:
+        point: ``(..., 3)``.
+        start: one end of the segment, ``(..., 3)``, broadcast with ``point``.
+        axis: unit vector to the other end, ``(..., 3)``.
+        length: ``(...)``.
+
+    Returns:
+        ``(...)``, the broadcast of all.
+    """
+    offset = point - start
+    along = torch.minimum((offset * axis).sum(-1).clamp(min=0.0), length)
+    return safe_norm(offset - along[..., None] * axis, dim=-1)
+
+
+def shortest_connection(start1: Tensor, edge1: Tensor, start2: Tensor, edge2: Tensor) -> Tensor:
+    """Vector from segment 1 to segment 2 at their closest points, as PyElastica's ``_find_min_dist``.
+
+    Args:
+        start1: start of segment 1, ``(..., 3, n)``; all four broadcast.
+        edge1: its end minus its start.
+        start2: start of segment 2.
+        edge2: its end minus its start.
+
+    Returns:
+        ``(..., 3, n)``. For nearly parallel segments PyElastica's shortcut, which isn't always the minimum.
+    """
+    between = start2 - start1
+    e11, e12, e22 = _dot(edge1, edge1), _dot(edge1, edge2), _dot(edge2, edge2)
+    b1, b2 = _dot(between, edge1), _dot(between, edge2)
+
+    # t runs along segment 1, s along segment 2. Parallel: project one start, then project back.
+    parallel = (1.0 - e12 * e12 / (e11 * e22)).abs() < _PARALLEL
+    t_parallel = (b1 / e11).clamp(0.0, 1.0)
+    s_parallel = ((t_parallel * e12 - b2) / e22).clamp(0.0, 1.0)
+
+    # Otherwise the closest points of the two infinite lines, where both lie on the segments...
+    s_line = (e12 * b1 - e11 * b2) / torch.where(parallel, 1.0, e11 * e22 - e12 * e12)
+    t_line = (e12 * s_line + b1) / e11
+    on_both = (s_line >= 0.0) & (s_line <= 1.0) & (t_line >= 0.0) & (t_line <= 1.0)
+
+    # ... and else the nearest of the four pairs (end of one segment, its projection on the other).
+    s_end, t_end = _nearest_end(e11, e12, e22, b1, b2)
+
+    s = torch.where(parallel, s_parallel, torch.where(on_both, s_line, s_end))
+    t = torch.where(parallel, t_parallel, torch.where(on_both, t_line, t_end))
+    return between + s.unsqueeze(-2) * edge2 - t.unsqueeze(-2) * edge1
+
+
+def _nearest_end(e11: Tensor, e12: Tensor, e22: Tensor, b1: Tensor, b2: Tensor) -> tuple[Tensor, Tensor]:
+    """Parameters ``s, t`` of the closest pair in which one point is an end; dot products as in the caller."""
+    zero, one = torch.zeros_like(b1), torch.ones_like(b1)
+    s = torch.stack([zero, one, (-b2 / e22).clamp(0.0, 1.0), ((e12 - b2) / e22).clamp(0.0, 1.0)])
+    t = torch.stack([(b1 / e11).clamp(0.0, 1.0), ((b1 + e12) / e11).clamp(0.0, 1.0), zero, one])
+    # Squared distance less |between|^2, which all four share.
+    square = s * (s * e22 + 2.0 * b2) + t * (t * e11 - 2.0 * b1) - 2.0 * s * t * e12
+    nearest = square.argmin(dim=0, keepdim=True)
+    return s.gather(0, nearest)[0], t.gather(0, nearest)[0]
+
+
+def _pair_forces(
+    gap: Tensor,
+    distance: Tensor,
+    penetration: Tensor,
+    approach: Tensor,
+    touching: Tensor,
+    parameters: RodParameters,
+) -> Tensor:
+    """Half the force of the rod on the cylinder for every pair, ``(num_envs, n_cylinders, 3, n_elements)``.
+
+    ``gap`` and ``approach`` are vectors (..., 3, n_elements); the others scalars (..., n_elements).
+    """
+    normal = gap / torch.where(distance > 0.0, distance, 1.0).unsqueeze(-2)
+    normal_speed = _dot(approach, normal)
+    magnitude = 0.5 * (parameters.contact_stiffness * penetration - parameters.contact_damping * normal_speed)
+    magnitude = torch.where(touching, magnitude, 0.0)
+    force = magnitude.unsqueeze(-2) * normal
+    if parameters.friction_coefficient == 0.0 or parameters.velocity_damping_coefficient == 0.0:
+        return force
+    # Regularised Coulomb friction: viscous up to the Coulomb limit, against the slip.
+    slip = approach - normal_speed.unsqueeze(-2) * normal
+    slip_speed = safe_norm(slip)
+    limit = parameters.friction_coefficient * magnitude.abs()
+    friction = torch.minimum(parameters.velocity_damping_coefficient * slip_speed, limit) / (slip_speed + 1e-14)
+    return force - friction.unsqueeze(-2) * slip
+
+
+def _existing(cylinders: Cylinders) -> tuple[Tensor, Tensor, Tensor]:
+    """Start and edge ``(num_envs, n_cylinders, 3, 1)`` and radius ``(num_envs, n_cylinders, 1)``.
+
+    Masked cylinders become harmless ones, because a NaN in a discarded branch still poisons gradients.
+    """
+    mask = cylinders.mask[..., None]
+    start = torch.where(mask, cylinders.start, 0.0)
+    edge = torch.where(mask, cylinders.length[..., None] * cylinders.axis, 1.0)
+    radius = torch.where(mask, cylinders.radius[..., None], 0.0)
+    return start[..., None], edge[..., None], radius
+
+
+def _tree_sum(force: Tensor) -> Tensor:
+    """Sum over cylinders, dimension 1, by adding neighbours.
+
+    ``torch.sum`` may add in an order that depends on the position in the batch; this order does not, nor does it depend
+    on how many masked cylinders pad the end.
+    """
+    while force.shape[1] > 1:
+        if force.shape[1] % 2:
+            force = torch.cat([force, torch.zeros_like(force[:, :1])], dim=1)
+        force = force[:, 0::2] + force[:, 1::2]
+    return force[:, 0]
+
+
+def _elements_to_nodes(force: Tensor) -> Tensor:
+    """Give each element's force ``(num_envs, 3, n_elements)`` to its two nodes, the outermost ones 2/3 : 4/3."""
+    share = torch.ones_like(force[0, 0])
+    first = torch.cat([share[:1] * (2.0 / 3.0), share[1:-1], share[-1:] * (4.0 / 3.0)])
+    zero = torch.zeros_like(force[..., :1])
+    return torch.cat([force * first, zero], dim=-1) + torch.cat([zero, force * first.flip(0)], dim=-1)
+
+
+def _dot(a: Tensor, b: Tensor) -> Tensor:
+    """Dot product over the components, dimension -2."""
+    return (a * b).sum(-2)

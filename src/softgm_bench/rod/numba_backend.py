@@ -1,0 +1,208 @@
+# Compiled callees reach a function as globals (see jit), out of the linters' sight.
+# ruff: noqa: F821
+# mypy: disable-error-code="name-defined"
+"""The fused CPU backend: a whole control step of every environment in one compiled call, parallel over environments."""
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from softgm_bench.rod.numba_contact import COLUMNS, EDGE, NEXT_CHECK, RADIUS, START, make_contact
+from softgm_bench.rod.numba_kernel import jit, make_kernel
+from softgm_bench.rod.numba_layout import Layout, constant_rows, make_layout
+from softgm_bench.rod.parameters import RodParameters, rod_constants
+from softgm_bench.rod.state import Cylinders, RodState
+
+
+class NumbaBackend:
+    """Rod dynamics on the CPU for float64 and float32 states; equal to ``TorchBackend`` to round-off."""
+
+    def __init__(self, parameters: RodParameters) -> None:
+        """Prepare for one arm; compilation happens at the first step of each precision and is cached on disk."""
+        self.parameters = parameters
+        self._constants = rod_constants(parameters)
+        gravity = np.asarray(parameters.gravity)[:, None] * self._constants.mass
+        self._weight = torch.as_tensor(gravity)
+        self._tables: dict[torch.dtype, tuple[NDArray, NDArray, NDArray]] = {}
+
+    def control_step(
+        self,
+        state: RodState,
+        couple: Tensor,
+        force: Tensor | None = None,
+        cylinders: Cylinders | None = None,
+        active: Tensor | None = None,
+        substeps: int | None = None,
+    ) -> RodState:
+        """Advance every rod by one control step.
+
+        Args:
+            state: not changed; float64 or float32 on the CPU.
+            couple: external couple on elements in the material frame, N m, ``(num_envs, 3, n_elements)``.
+            force: external force on nodes in the world frame, N, ``(num_envs, 3, n_nodes)``; gravity is added.
+            cylinders: what the rods may touch.
+            active: ``(num_envs,)`` bool; rods that are not come back as they were.
+            substeps: of this step, the parameters' number by default.
+
+        Returns:
+            A new state.
+        """
+        dtype = state.position.dtype
+        num_envs, n = couple.shape[0], self.parameters.n_elements
+        rows, scalars, contact = self._table(dtype)
+        new = state.clone()
+        arrays = [field.numpy() for field in (new.position, new.director, new.velocity, new.omega)]
+        weight = self._weight.to(dtype).expand(num_envs, 3, n + 1)
+        total_force = (weight if force is None else force.to(dtype) + weight).contiguous()
+        table = _cylinder_table(cylinders, num_envs, dtype)
+        if active is None:
+            active = torch.ones(num_envs, dtype=torch.bool)
+        step = _make_step(n, arrays[0].dtype.type)
+        step(
+            *arrays,
+            couple.detach().to(dtype).contiguous().numpy(),
+            total_force.numpy(),
+            table.numpy(),
+            active.contiguous().numpy(),
+            rows,
+            scalars,
+            contact,
+            self.parameters.substeps if substeps is None else substeps,
+        )
+        return new
+
+    def _table(self, dtype: torch.dtype) -> tuple[NDArray, NDArray, NDArray]:
+        if dtype not in self._tables:
+            p = self.parameters
+            real = torch.empty(0, dtype=dtype).numpy().dtype
+            rows = constant_rows(p, make_layout(p.n_elements), real)
+            scalars = np.array([p.dt, self._constants.translational_decay, self._constants.volume.max()], dtype=real)
+            contact = np.array(
+                [p.contact_stiffness, p.contact_damping, p.friction_coefficient, p.velocity_damping_coefficient],
+                dtype=real,
+            )
+            self._tables[dtype] = rows, scalars, contact
+        return self._tables[dtype]
+
+
+def _cylinder_table(cylinders: Cylinders | None, num_envs: int, dtype: torch.dtype) -> Tensor:
+    """Rows of start, edge, radius and next check, ``(num_envs, n_cylinders, 8)``; a masked one is never checked."""
+    if cylinders is None:
+        return torch.empty((num_envs, 0, COLUMNS), dtype=dtype)
+    table = torch.empty((*cylinders.mask.shape, COLUMNS), dtype=dtype)
+    table[..., START : START + 3] = cylinders.start
+    table[..., EDGE : EDGE + 3] = cylinders.axis * cylinders.length.unsqueeze(-1)
+    table[..., RADIUS] = cylinders.radius
+    table[..., NEXT_CHECK] = torch.where(cylinders.mask, -torch.inf, torch.inf)
+    return table
+
+
+@lru_cache
+def _make_step(n_elements: int, dtype: type) -> Callable[..., Any]:
+    """Compile the loop over environments and substeps for one element count and one precision."""
+    layout = make_layout(n_elements)
+
+    def control_step(
+        position, director, velocity, omega, couple, force, cylinders, active, rows, scalars, contact, substeps
+    ):
+        for b in numba.prange(position.shape[0]):
+            if active[b]:
+                s = np.empty(layout.size, rows.dtype)
+                s[:] = rows
+                load(s, position[b], director[b], velocity[b], omega[b], couple[b], force[b])
+                advance(s, cylinders[b], scalars, contact, substeps)
+                store(s, position[b], director[b], velocity[b], omega[b])
+
+    return jit(
+        control_step,
+        parallel=True,
+        load=_make_load(layout),
+        store=_make_store(layout),
+        advance=_make_advance(layout, dtype),
+    )
+
+
+def _make_advance(layout: Layout, real: type) -> Callable[..., Any]:
+    p, n = layout, layout.n
+    zero, half = real(0.0), real(0.5)
+
+    def advance(s, cylinders, scalars, contact, substeps):
+        dt, decay, volume = scalars[0], scalars[1], scalars[2]
+        touched = False
+        fastest = zero
+        for k in range(n + 1):
+            fastest = max(fastest, s[p.vx + k] ** 2 + s[p.vy + k] ** 2 + s[p.vz + k] ** 2)
+        travelled = half * dt * np.sqrt(fastest)
+        rotate(s, half * dt)
+        move(s, half * dt)
+        for substep in range(substeps):
+            stresses(s)
+            couples(s)
+            if cylinders.shape[0] > 0:
+                touching = add_contact(s, cylinders, travelled, contact, volume)
+                if touched and not touching:
+                    for k in range(n + 1):
+                        s[p.fx + k] = s[p.gx + k]
+                        s[p.fy + k] = s[p.gy + k]
+                        s[p.fz + k] = s[p.gz + k]
+                touched = touching
+            spin(s, dt)
+            fastest = push(s, dt, decay)
+            # the half steps that end this substep and begin the next one are one
+            step = half * dt if substep == substeps - 1 else dt
+            travelled += step * np.sqrt(fastest)
+            rotate(s, step)
+            move(s, step)
+
+    return jit(advance, add_contact=make_contact(n, real), **make_kernel(n, real)._asdict())
+
+
+def _make_load(layout: Layout) -> Callable[..., Any]:
+    p, n = layout, layout.n
+
+    def load(s, position, director, velocity, omega, couple, force):
+        for i, (x, v, g, f) in enumerate(
+            ((p.px, p.vx, p.gx, p.fx), (p.py, p.vy, p.gy, p.fy), (p.pz, p.vz, p.gz, p.fz))
+        ):
+            s[x : x + n + 1] = position[i]
+            s[v : v + n + 1] = velocity[i]
+            s[g : g + n + 1] = force[i]
+            s[f : f + n + 1] = force[i]
+        for i, (q0, q1, q2, w, t) in enumerate(
+            (
+                (p.q00, p.q01, p.q02, p.w0, p.t0),
+                (p.q10, p.q11, p.q12, p.w1, p.t1),
+                (p.q20, p.q21, p.q22, p.w2, p.t2),
+            )
+        ):
+            s[q0 : q0 + n] = director[i, 0]
+            s[q1 : q1 + n] = director[i, 1]
+            s[q2 : q2 + n] = director[i, 2]
+            s[w : w + n] = omega[i]
+            s[t : t + n] = couple[i]
+
+    return jit(load)
+
+
+def _make_store(layout: Layout) -> Callable[..., Any]:
+    p, n = layout, layout.n
+
+    def store(s, position, director, velocity, omega):
+        for i, (x, v) in enumerate(((p.px, p.vx), (p.py, p.vy), (p.pz, p.vz))):
+            position[i] = s[x : x + n + 1]
+            velocity[i] = s[v : v + n + 1]
+        for i, (q0, q1, q2, w) in enumerate(
+            ((p.q00, p.q01, p.q02, p.w0), (p.q10, p.q11, p.q12, p.w1), (p.q20, p.q21, p.q22, p.w2))
+        ):
+            director[i, 0] = s[q0 : q0 + n]
+            director[i, 1] = s[q1 : q1 + n]
+            director[i, 2] = s[q2 : q2 + n]
+            omega[i] = s[w : w + n]
+
+    return jit(store)

@@ -1,0 +1,337 @@
+"""Differentiable reference of the rod's motion: PyElastica 1.0.0's equations in batched PyTorch.
+
+Every function takes tensors whose first dimension is the environment and whose last is the node, element or Voronoi
+region. Only elementwise operations and sums over three components are used, so that an environment's result doesn't
+depend on its neighbours in the batch, bit for bit.
+"""
+
+import math
+from types import SimpleNamespace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from softgm_bench.rod.contact import contact_forces, element_length, element_radius
+from softgm_bench.rod.parameters import RodParameters, rod_constants
+from softgm_bench.rod.state import Cylinders, RodState
+
+# Taylor coefficients, enough for float64's round-off below _SERIES_BELOW (a squared angle).
+_SERIES_BELOW = 0.09
+_SINE = tuple((-1.0) ** n / math.factorial(2 * n + 1) for n in range(7))
+_COSINE = tuple((-1.0) ** n / math.factorial(2 * n + 2) for n in range(7))
+_ANGLE_OVER_SINE = tuple(4.0**n * math.factorial(n) ** 2 / math.factorial(2 * n + 1) for n in range(11))
+
+
+class Motion(NamedTuple):
+    """The fields of ``RodState`` as plain tensors, with the same shapes."""
+
+    position: Tensor
+    director: Tensor
+    velocity: Tensor
+    omega: Tensor
+
+
+class Geometry(NamedTuple):
+    """What follows from node positions (Gazzola et al. 2018, eqs 3.3 and 3.4).
+
+    Attributes:
+        tangent: ``(num_envs, 3, n_elements)``.
+        dilatation: length over rest length, ``(num_envs, n_elements)``.
+        voronoi_dilatation: ``(num_envs, n_elements - 1)``.
+    """
+
+    tangent: Tensor
+    dilatation: Tensor
+    voronoi_dilatation: Tensor
+
+
+class TorchBackend:
+    """Moves rods by position Verlet with a clamped base, analytical damping and contact; device and dtype of the state.
+
+    Attributes:
+        parameters: of every rod.
+    """
+
+    def __init__(self, parameters: RodParameters) -> None:
+        """Hold the parameters; tensors are made at the first step on a device."""
+        self.parameters = parameters
+        self._constants = rod_constants(parameters)
+        self._tensors: dict[tuple[torch.dtype, torch.device], SimpleNamespace] = {}
+
+    def control_step(
+        self,
+        state: RodState,
+        couple: Tensor,
+        force: Tensor | None = None,
+        cylinders: Cylinders | None = None,
+        active: Tensor | None = None,
+        substeps: int | None = None,
+    ) -> RodState:
+        """Advance by one control step, with loads held constant.
+
+        Args:
+            state: never changed.
+            couple: external couple in the material frame on each element, N m, ``(num_envs, 3, n_elements)``.
+            force: external force in the world frame on each node besides gravity, N, ``(num_envs, 3, n_nodes)``.
+            cylinders: obstacles, of the same ``num_envs``.
+            active: bool, ``(num_envs,)``; environments where it is False come back unchanged, bit for bit.
+            substeps: Verlet steps of ``parameters.dt``; ``parameters.substeps`` by default.
+
+        Returns:
+            A new state.
+
+        Raises:
+            ValueError: if ``couple`` or ``force`` don't fit the state.
+        """
+        _require_shape("couple", couple, state.omega)
+        if force is not None:
+            _require_shape("force", force, state.velocity)
+        motion = Motion(state.position, state.director, state.velocity, state.omega)
+        if active is None:
+            moved = self._advance(motion, couple, force, cylinders, substeps)
+        else:
+            # Resting environments aren't computed at all: one that has diverged can't poison gradients.
+            chosen = active.nonzero().squeeze(-1)
+            moved = self._advance(
+                Motion(*(old[chosen] for old in motion)),
+                couple[chosen],
+                None if force is None else force[chosen],
+                None if cylinders is None else cylinders[chosen],
+                substeps,
+            )
+            moved = Motion(*(old.index_put((chosen,), new) for old, new in zip(motion, moved, strict=True)))
+        return RodState(**moved._asdict(), batch_size=state.batch_size)
+
+    def _advance(
+        self, motion: Motion, couple: Tensor, force: Tensor | None, cylinders: Cylinders | None, substeps: int | None
+    ) -> Motion:
+        """``control_step`` on plain tensors, every environment moving."""
+        constants = self._constants_like(motion.position)
+        external_force = constants.weight if force is None else constants.weight + force
+        for _ in range(self.parameters.substeps if substeps is None else substeps):
+            motion = self._substep(motion, constants, couple, external_force, cylinders)
+        return motion
+
+    def _substep(
+        self,
+        motion: Motion,
+        constants: SimpleNamespace,
+        couple: Tensor,
+        external_force: Tensor,
+        cylinders: Cylinders | None,
+    ) -> Motion:
+        """One position-Verlet step in the order of PyElastica's ``SymplecticStepperMixin.step``."""
+        dt = self.parameters.dt
+        motion = constrain_values(kinematic_step(motion, 0.5 * dt), constants)
+
+        now = geometry(motion.position, constants)
+        stress = internal_stress(motion.director, now, constants)
+        force = internal_forces(motion.director, stress, now) + external_force
+        if cylinders is not None:
+            radius = element_radius(motion.position, constants.volume)
+            force = force + contact_forces(motion.position, motion.velocity, radius, cylinders, self.parameters)
+        torque = internal_torques(motion, stress, now, constants) + couple
+
+        motion = dynamic_step(motion, force, torque, now.dilatation, constants, dt)
+        motion = dampen(constrain_rates(motion), now.dilatation, constants)
+        return constrain_values(kinematic_step(motion, 0.5 * dt), constants)
+
+    def _constants_like(self, tensor: Tensor) -> SimpleNamespace:
+        """The rod's constants, and the nodes' weight ``(3, n_nodes)``, in the tensor's dtype and on its device."""
+        key = (tensor.dtype, tensor.device)
+        if key not in self._tensors:
+            fields = self._constants._asdict()
+            fields["weight"] = np.array(self.parameters.gravity)[:, None] * self._constants.mass
+            for name, value in fields.items():
+                if isinstance(value, np.ndarray):
+                    fields[name] = torch.as_tensor(value, dtype=tensor.dtype, device=tensor.device)
+            self._tensors[key] = SimpleNamespace(**fields)
+        return self._tensors[key]
+
+
+def kinematic_step(motion: Motion, duration: float) -> Motion:
+    """Move nodes and turn directors with constant rates (PyElastica's ``overload_operator_kinematic_numba``).
+
+    Directors turn by Rodrigues' formula and aren't re-orthonormalised. PyElastica divides the axis by
+    ``|omega| + 1e-14``. Dropping that 1e-14 changes an angle by at most ``duration * 1e-14``, far below round-off, and
+    keeps the true derivative at rest, where PyElastica's formula has a spurious zero.
+    """
+    angle = (duration * motion.omega)[:, :, None]  # (num_envs, 3, 1, n_elements): one vector for all three columns
+    sine, cosine = sine_and_cosine_terms((angle * angle).sum(1, keepdim=True))
+    turned = torch.linalg.cross(motion.director, angle, dim=1)
+    director = motion.director + sine * turned + cosine * torch.linalg.cross(turned, angle, dim=1)
+    return motion._replace(position=motion.position + duration * motion.velocity, director=director)
+
+
+def dynamic_step(
+    motion: Motion, force: Tensor, torque: Tensor, dilatation: Tensor, constants: SimpleNamespace, dt: float
+) -> Motion:
+    """Accelerate (Gazzola et al. 2018, eqs 3.8 and 3.9; PyElastica's ``_update_accelerations``).
+
+    Args:
+        motion: velocities of which change.
+        force: total on each node, world frame, ``(num_envs, 3, n_nodes)``.
+        torque: total on each element, material frame, ``(num_envs, 3, n_elements)``.
+        dilatation: ``(num_envs, n_elements)``.
+        constants: of the rod.
+        dt: s.
+    """
+    return motion._replace(
+        velocity=motion.velocity + dt * (force / constants.mass),
+        omega=motion.omega + dt * (torque / constants.inertia * dilatation[:, None]),
+    )
+
+
+def constrain_values(motion: Motion, constants: SimpleNamespace) -> Motion:
+    """Put node 0 and element 0 where they are at rest (``OneEndFixedBC.constrain_values``)."""
+    base, frame = constants.position[:, :1], constants.director[..., :1]
+    num_envs = motion.position.shape[0]
+    return motion._replace(
+        position=torch.cat([base.expand(num_envs, -1, -1), motion.position[..., 1:]], dim=-1),
+        director=torch.cat([frame.expand(num_envs, -1, -1, -1), motion.director[..., 1:]], dim=-1),
+    )
+
+
+def constrain_rates(motion: Motion) -> Motion:
+    """Stop node 0 and element 0 (``OneEndFixedBC.constrain_rates``)."""
+    return motion._replace(
+        velocity=torch.cat([torch.zeros_like(motion.velocity[..., :1]), motion.velocity[..., 1:]], dim=-1),
+        omega=torch.cat([torch.zeros_like(motion.omega[..., :1]), motion.omega[..., 1:]], dim=-1),
+    )
+
+
+def dampen(motion: Motion, dilatation: Tensor, constants: SimpleNamespace) -> Motion:
+    """Exact decay of the rates over one step (``AnalyticalLinearDamper.dampen_rates``, both protocols)."""
+    rate = constants.rotational_decay_rate
+    exponent = rate * dilatation[:, None] if constants.decay_follows_dilatation else rate
+    return motion._replace(
+        velocity=motion.velocity * constants.translational_decay, omega=motion.omega * torch.exp(-exponent)
+    )
+
+
+def geometry(position: Tensor, constants: SimpleNamespace) -> Geometry:
+    """Tangents and dilatations from nodes ``(num_envs, 3, n_nodes)`` (``_compute_all_dilatations``)."""
+    length = element_length(position)
+    voronoi_length = 0.5 * (length[:, 1:] + length[:, :-1])
+    return Geometry(
+        tangent=(position[..., 1:] - position[..., :-1]) / length[:, None],
+        dilatation=length / constants.rest_length,
+        voronoi_dilatation=voronoi_length / constants.rest_voronoi_length,
+    )
+
+
+def internal_stress(director: Tensor, now: Geometry, constants: SimpleNamespace) -> Tensor:
+    """Shear/stretch stress n_L = S sigma with sigma = e Q t - (0, 0, 1) (``_compute_shear_stretch_strains``).
+
+    Returns:
+        In the material frame, ``(num_envs, 3, n_elements)``.
+    """
+    stretched = now.dilatation[:, None] * to_material(director, now.tangent)
+    shear, stretch = stretched[:, :2], stretched[:, 2:] - 1.0
+    return constants.shear * torch.cat([shear, stretch], dim=1)
+
+
+def internal_forces(director: Tensor, stress: Tensor, now: Geometry) -> Tensor:
+    """Differences of Q^T n_L / e over nodes (eq. 3.8; ``_compute_internal_forces``): ``(num_envs, 3, n_nodes)``."""
+    return difference(to_world(director, stress) / now.dilatation[:, None])
+
+
+def internal_torques(motion: Motion, stress: Tensor, now: Geometry, constants: SimpleNamespace) -> Tensor:
+    """Couples on the elements (eq. 3.9; ``_compute_internal_torques``).
+
+    Returns:
+        In the material frame, ``(num_envs, 3, n_elements)``.
+    """
+    kappa = curvature(motion.director, constants)
+    couple = constants.bend * kappa
+    inverse_cube = (1.0 / now.voronoi_dilatation**3)[:, None]
+    bend_twist = difference(couple * inverse_cube) + quadrature(
+        torch.linalg.cross(kappa, couple, dim=1) * constants.rest_voronoi_length * inverse_cube
+    )
+    shear_stretch = torch.linalg.cross(to_material(motion.director, now.tangent), stress, dim=1) * constants.rest_length
+    edge_velocity = motion.velocity[..., 1:] - motion.velocity[..., :-1]
+    dilatation_rate = (now.tangent * edge_velocity).sum(1) / constants.rest_length
+    momentum = constants.inertia * motion.omega / now.dilatation[:, None]  # J omega / e
+    transport = torch.linalg.cross(momentum, motion.omega, dim=1)
+    unsteady = momentum * (dilatation_rate / now.dilatation)[:, None]
+    return bend_twist + shear_stretch + transport + unsteady
+
+
+def curvature(director: Tensor, constants: SimpleNamespace) -> Tensor:
+    """Bend/twist strain kappa, the rotation vector between neighbours over the Voronoi length (``_inv_rotate``).
+
+    Args:
+        director: Q, ``(num_envs, 3, 3, n_elements)``.
+        constants: of the rod.
+
+    Returns:
+        ``(num_envs, 3, n_elements - 1)``.
+    """
+    here, following = director[..., :-1], director[..., 1:]
+    # R = Q_{k+1} Q_k^T has R_ij = following_i . here_j; summed over the columns of Q, this is its axis * 2 sin(theta).
+    axis = torch.linalg.cross(following, here, dim=1).sum(2)
+    trace = (here * following).sum(2).sum(1)
+    half_versine = ((3.0 - trace) * 0.25).clamp(0.0, 1.0)  # (1 - cos(theta)) / 2
+    return 0.5 * angle_over_sine(half_versine)[:, None] * axis / constants.rest_voronoi_length
+
+
+def sine_and_cosine_terms(square: Tensor) -> tuple[Tensor, Tensor]:
+    """``sin(x) / x`` and ``(1 - cos(x)) / x^2`` as functions of ``x^2``, smooth at 0."""
+    near = square < _SERIES_BELOW
+    series = torch.where(near, square, 0.0)
+    far = torch.where(near, 1.0, square)
+    x = far.sqrt()
+    return (
+        torch.where(near, _polynomial(_SINE, series), x.sin() / x),
+        torch.where(near, _polynomial(_COSINE, series), (1.0 - x.cos()) / far),
+    )
+
+
+def angle_over_sine(half_versine: Tensor) -> Tensor:
+    """``theta / sin(theta)`` as a function of ``w = (1 - cos(theta)) / 2`` in [0, 1], smooth at 0.
+
+    PyElastica's ``arccos`` has no derivative at theta = 0; this function's is 2/3. It is finite at theta = pi.
+    """
+    near = half_versine < 0.25 * _SERIES_BELOW
+    series = torch.where(near, half_versine, 0.0)
+    far = torch.where(near, 0.5, half_versine).clamp(max=1.0 - torch.finfo(half_versine.dtype).eps)
+    closed_form = torch.asin(far.sqrt()) / (far * (1.0 - far)).sqrt()
+    return torch.where(near, _polynomial(_ANGLE_OVER_SINE, series), closed_form)
+
+
+def to_material(director: Tensor, vector: Tensor) -> Tensor:
+    """Q v for each element: ``(num_envs, 3, 3, n_elements)`` and ``(num_envs, 3, n_elements)``."""
+    return (director * vector[:, None]).sum(2)
+
+
+def to_world(director: Tensor, vector: Tensor) -> Tensor:
+    """Q^T v for each element: ``(num_envs, 3, 3, n_elements)`` and ``(num_envs, 3, n_elements)``."""
+    return (director * vector[:, :, None]).sum(1)
+
+
+def difference(values: Tensor) -> Tensor:
+    """Difference of neighbours, zeros beyond the ends, ``(..., n)`` to ``(..., n + 1)`` (``_two_point_difference``)."""
+    zero = torch.zeros_like(values[..., :1])
+    return torch.cat([values, zero], dim=-1) - torch.cat([zero, values], dim=-1)
+
+
+def quadrature(values: Tensor) -> Tensor:
+    """Mean of neighbours, zeros beyond the ends, ``(..., n)`` to ``(..., n + 1)`` (``_trapezoidal``)."""
+    zero = torch.zeros_like(values[..., :1])
+    return 0.5 * (torch.cat([values, zero], dim=-1) + torch.cat([zero, values], dim=-1))
+
+
+def _polynomial(coefficients: tuple[float, ...], x: Tensor) -> Tensor:
+    """Horner's scheme; the first coefficient is the constant."""
+    value = torch.full_like(x, coefficients[-1])
+    for coefficient in coefficients[-2::-1]:
+        value = value * x + coefficient
+    return value
+
+
+def _require_shape(name: str, tensor: Tensor, like: Tensor) -> None:
+    """Raise a ``ValueError`` that names the tensor if its shape isn't that of ``like``."""
+    if tensor.shape != like.shape:
+        raise ValueError(f"{name} has shape {tuple(tensor.shape)}: the state needs {tuple(like.shape)}")
