@@ -1,1 +1,27 @@
 """The soft arm as TorchRL environments."""
+
+import torch
+
+from softgm_bench.envs.soft_arm import SoftArmEnv
+from softgm_bench.envs.tasks import TaskConfig, make_task
+from softgm_bench.rod.backend import make_backend
+from softgm_bench.rod.parameters import RodParameters
+
+
+def make_env(
+    task_config: TaskConfig,
+    rod_parameters: RodParameters,
+    num_envs: int,
+    seed: int,
+    horizon: int | None = None,
+    device: torch.device | str = "cpu",
+    backend: str = "numba",
+    dtype: torch.dtype = torch.float64,
+) -> SoftArmEnv:
+    """Build ``num_envs`` environments of one task; see ``SoftArmEnv`` for the arguments."""
+    return SoftArmEnv(
+        make_task(task_config), make_backend(backend, rod_parameters), num_envs, seed, horizon, device, dtype
+    )
+
+
+__all__ = ["SoftArmEnv", "make_env"]

@@ -1,0 +1,145 @@
+"""Online discovery: obstacles cut into bins, bins found by agents, a table of slots that remembers them.
+
+Paper, section "Graph Construction". Everything is batched over environments; a bin is a (cylinder, index) pair.
+"""
+
+import math
+
+import torch
+from tensordict import TensorClass
+from torch import Tensor
+
+from softgm_bench.rod.state import Cylinders
+
+
+class Bins(TensorClass):
+    """All bins of all cylinders, known to the simulator alone; ``batch_size`` is ``(num_envs,)``.
+
+    Attributes:
+        descriptor: centre, axis, and (radius, cylinder length, normalised axial position of the centre):
+            ``(num_envs, n_bins, 9)``.
+        mask: which exist, ``(num_envs, n_bins)`` bool.
+    """
+
+    descriptor: Tensor
+    mask: Tensor
+
+
+class SlotTable(TensorClass):
+    """The obstacle slots of the observation graph; ``batch_size`` is ``(num_envs,)``.
+
+    Attributes:
+        bin_of_slot: index of the bin in each slot, -1 for PAD, ``(num_envs, n_slots)`` int64.
+        known: bins that were met before, stored or dropped, ``(num_envs, n_bins)`` bool.
+        count: slots in use, ``(num_envs,)`` int64.
+        dropped: bins that found no free slot, ``(num_envs,)`` int64.
+    """
+
+    bin_of_slot: Tensor
+    known: Tensor
+    count: Tensor
+    dropped: Tensor
+
+
+def bins_per_cylinder(max_length: float, bin_length: float) -> int:
+    """Bins that the longest cylinder is cut into; the last one may be shorter."""
+    return math.ceil(max_length / bin_length - 1e-9)
+
+
+def cut_into_bins(cylinders: Cylinders, bin_length: float, max_length: float) -> Bins:
+    """Cut every cylinder along its axis into bins of ``bin_length`` m from its start.
+
+    Args:
+        cylinders: ``n_cylinders`` an environment.
+        bin_length: m; the last bin of a cylinder ends where the cylinder does.
+        max_length: of any cylinder, m; fixes the number of bins.
+
+    Returns:
+        ``n_cylinders * bins_per_cylinder(max_length, bin_length)`` bins, cylinder by cylinder.
+    """
+    length = cylinders.length.unsqueeze(-1)  # (num_envs, n_cylinders, 1)
+    near = bin_length * torch.arange(
+        bins_per_cylinder(max_length, bin_length), dtype=length.dtype, device=length.device
+    )
+    far = torch.minimum(near + bin_length, length)
+    mask = cylinders.mask.unsqueeze(-1) & (near < length - 1e-9)
+    middle = 0.5 * (near + far)  # (num_envs, n_cylinders, n)
+    axis = cylinders.axis.unsqueeze(-2).expand(*middle.shape, 3)
+    centre = cylinders.start.unsqueeze(-2) + middle.unsqueeze(-1) * axis
+    scalars = torch.stack(
+        [cylinders.radius.unsqueeze(-1).expand_as(middle), length.expand_as(middle), middle / length], dim=-1
+    )
+    descriptor = torch.cat([centre, axis, scalars], dim=-1) * mask.unsqueeze(-1)
+    return Bins(descriptor=descriptor.flatten(1, 2), mask=mask.flatten(1, 2), batch_size=cylinders.batch_size)
+
+
+def empty_table(num_envs: int, n_slots: int, n_bins: int, device: torch.device) -> SlotTable:
+    """A table in which nothing has been discovered."""
+    count = torch.zeros(num_envs, dtype=torch.int64, device=device)
+    return SlotTable(
+        bin_of_slot=torch.full((num_envs, n_slots), -1, dtype=torch.int64, device=device),
+        known=torch.zeros((num_envs, n_bins), dtype=torch.bool, device=device),
+        count=count,
+        dropped=count.clone(),
+        batch_size=[num_envs],
+    )
+
+
+def sense(agent_position: Tensor, bins: Bins, sensing_radius: float) -> Tensor:
+    """Which agent senses which bin: ``||p_i - c_k|| - r_k < rho``.
+
+    Args:
+        agent_position: m, ``(num_envs, n_agents, 3)``.
+        bins: of the same environments.
+        sensing_radius: rho, m.
+
+    Returns:
+        ``(num_envs, n_agents, n_bins)`` bool.
+    """
+    distance = torch.cdist(agent_position, bins.descriptor[..., :3], compute_mode="donot_use_mm_for_euclid_dist")
+    return (distance - bins.descriptor[..., 6].unsqueeze(1) < sensing_radius) & bins.mask.unsqueeze(1)
+
+
+def discover(table: SlotTable, sensed: Tensor) -> tuple[SlotTable, Tensor]:
+    """Put newly sensed bins into the first free slots, in the order of their index.
+
+    Args:
+        table: not changed.
+        sensed: ``(num_envs, n_agents, n_bins)`` bool.
+
+    Returns:
+        The table after this step, and the number of bins stored by it, ``(num_envs,)`` int64.
+    """
+    new = sensed.any(dim=1) & ~table.known
+    if not bool(new.any()):
+        return table, torch.zeros_like(table.count)
+    slot = table.count.unsqueeze(-1) + new.cumsum(dim=-1) - 1
+    stored = new & (slot < table.bin_of_slot.shape[1])
+    env, index = stored.nonzero(as_tuple=True)
+    bin_of_slot = table.bin_of_slot.clone()
+    bin_of_slot[env, slot[env, index]] = index
+    n_stored = stored.sum(dim=-1)
+    return (
+        SlotTable(
+            bin_of_slot=bin_of_slot,
+            known=table.known | new,
+            count=table.count + n_stored,
+            dropped=table.dropped + new.sum(dim=-1) - n_stored,
+            batch_size=table.batch_size,
+        ),
+        n_stored,
+    )
+
+
+def observe_slots(table: SlotTable, bins: Bins, sensed: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """What the graph shows of the obstacles.
+
+    Returns:
+        Descriptors ``(num_envs, n_slots, 9)``, zero for PAD; active slots ``(num_envs, n_slots)``; edges from slot to
+        agent ``(num_envs, n_agents, n_slots)``, which exist while the agent senses the slot's bin.
+    """
+    active = table.bin_of_slot >= 0
+    index = table.bin_of_slot.clamp(min=0)
+    descriptor = bins.descriptor.gather(1, index.unsqueeze(-1).expand(-1, -1, 9)) * active.unsqueeze(-1)
+    edge = sensed.gather(2, index.unsqueeze(1).expand(-1, sensed.shape[1], -1)) & active.unsqueeze(1)
+    return descriptor, active, edge

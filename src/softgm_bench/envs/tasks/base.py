@@ -1,0 +1,155 @@
+"""What a task is: a configuration, and scenes drawn for any number of environments at once."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+from tensordict import TensorClass
+from torch import Tensor
+
+from softgm_bench.rod.state import Cylinders
+
+Range = tuple[float, float]
+
+
+@dataclass
+class RewardConfig:
+    """Coefficients of the eight reward terms, named as in the paper; values in ``conf/task/reward``."""
+
+    lambda_p: float
+    lambda_da: float
+    lambda_t: float
+    lambda_c: float
+    lambda_cn: float
+    lambda_d: float
+    k_max: int
+    lambda_s: float
+    epsilon: float
+    lambda_succ: float
+
+
+@dataclass
+class ActuationConfig:
+    """How actions become couples on the rod; see ``softgm_bench.rod.actuation``."""
+
+    basis: str
+    scaling: str
+    max_torque: float
+
+
+@dataclass
+class TaskConfig:
+    """What every task has; values and their meaning in ``conf/task``."""
+
+    name: str
+    n_agents: int
+    horizon: int
+    success_radius: float
+    min_dilatation: float
+    max_dilatation: float
+    sensing_radius: float
+    bin_length: float
+    slots: int
+    actuation: ActuationConfig
+    reward: RewardConfig
+
+
+class Scene(TensorClass):
+    """What is drawn at a reset; ``batch_size`` is ``(num_envs,)``.
+
+    Attributes:
+        target: m, ``(num_envs, 3)``.
+        cylinders: the obstacles, padded to the task's ``max_cylinders``.
+    """
+
+    target: Tensor
+    cylinders: Cylinders
+
+
+class Task(ABC):
+    """One family of scenes.
+
+    A new task is one file with a configuration dataclass and a subclass, and one YAML file with the values.
+
+    Attributes:
+        max_cylinders: the number that scenes are padded to.
+        max_cylinder_length: the longest cylinder of any scene, m; 0 where there is none.
+    """
+
+    config_class: ClassVar[type[TaskConfig]]
+    max_cylinders: int = 0
+    max_cylinder_length: float = 0.0
+
+    def __init__(self, config: Any) -> None:
+        """Keep the configuration."""
+        self.config = config
+
+    @abstractmethod
+    def sample(self, count: int, generator: torch.Generator) -> Scene:
+        """Draw ``count`` scenes, float64, on the generator's device."""
+
+
+def uniform(count: int, bounds: Range, generator: torch.Generator) -> Tensor:
+    """Draw from ``[low, high]``: ``(count,)`` float64."""
+    low, high = bounds
+    noise = torch.rand(count, generator=generator, device=generator.device, dtype=torch.float64)
+    return low + (high - low) * noise
+
+
+def uniform_box(count: int, bounds: tuple[Range, Range, Range], generator: torch.Generator) -> Tensor:
+    """Draw points from a box: ``(count, 3)`` float64."""
+    return torch.stack([uniform(count, axis, generator) for axis in bounds], dim=-1)
+
+
+def redraw_until(draw: Callable[[int], Tensor], accept: Callable[[Tensor], Tensor], count: int, what: str) -> Tensor:
+    """Rejection sampling for a whole batch: redraw the rejected rows until all are accepted.
+
+    Raises:
+        ValueError: if some rows are still rejected after 1000 rounds: the ranges leave (almost) nothing.
+    """
+    values = draw(count)
+    for _ in range(1000):
+        rejected = (~accept(values)).nonzero().squeeze(-1)
+        if len(rejected) == 0:
+            return values
+        values[rejected] = draw(len(rejected))
+    raise ValueError(f"task: no admissible {what} found in 1000 draws: widen its ranges")
+
+
+def no_cylinders(count: int, device: torch.device) -> Cylinders:
+    """Scenes without obstacles."""
+    empty = torch.empty((count, 0), dtype=torch.float64, device=device)
+    vectors = empty.unsqueeze(-1).expand(count, 0, 3)
+    return Cylinders(
+        start=vectors,
+        axis=vectors,
+        length=empty,
+        radius=empty,
+        mask=empty.bool(),
+        batch_size=[count],
+    )
+
+
+def upright_cylinders(xy: Tensor, bottom: Tensor, top: Tensor, radius: float, mask: Tensor) -> Cylinders:
+    """Cylinders along +z.
+
+    Args:
+        xy: axes' positions, m, ``(count, n_cylinders, 2)``.
+        bottom: height of the lower end, m, ``(count, n_cylinders)``.
+        top: height of the upper end, m, ``(count, n_cylinders)``.
+        radius: of all of them, m.
+        mask: which exist, ``(count, n_cylinders)`` bool.
+    """
+    axis = torch.zeros((*bottom.shape, 3), dtype=bottom.dtype, device=bottom.device)
+    axis[..., 2] = 1.0
+    return Cylinders(
+        start=torch.cat([xy, bottom.unsqueeze(-1)], dim=-1),
+        axis=axis,
+        # a masked cylinder keeps a positive length so that nothing divides by zero
+        length=torch.where(mask, top - bottom, 1.0),
+        radius=torch.full_like(bottom, radius),
+        mask=mask,
+        batch_size=bottom.shape[:1],
+    )

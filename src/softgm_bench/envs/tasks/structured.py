@@ -1,0 +1,44 @@
+"""``structured``: two fixed posts between the arm and the targets (paper, scenario b)."""
+
+from dataclasses import dataclass
+
+import torch
+
+from softgm_bench.envs.tasks.base import Range, Scene, Task, TaskConfig, uniform_box, upright_cylinders
+
+
+@dataclass
+class StructuredConfig(TaskConfig):
+    """Posts along z at (x, +-y), targets in a box."""
+
+    post_radius: float
+    post_x: float
+    post_y: float
+    post_z: Range
+    target_x: Range
+    target_y: Range
+    target_z: Range
+
+
+class Structured(Task):
+    """The posts stand still; only the target is drawn (SPEC section 3)."""
+
+    config_class = StructuredConfig
+    max_cylinders = 2
+
+    def __init__(self, config: StructuredConfig) -> None:
+        """Note the posts' length."""
+        super().__init__(config)
+        self.max_cylinder_length = config.post_z[1] - config.post_z[0]
+
+    def sample(self, count: int, generator: torch.Generator) -> Scene:
+        """Draw ``count`` scenes."""
+        c = self.config
+        xy = torch.tensor(
+            [[c.post_x, -c.post_y], [c.post_x, c.post_y]], dtype=torch.float64, device=generator.device
+        ).expand(count, 2, 2)
+        bottom = torch.full_like(xy[..., 0], c.post_z[0])
+        top = torch.full_like(bottom, c.post_z[1])
+        posts = upright_cylinders(xy, bottom, top, c.post_radius, torch.ones_like(bottom, dtype=torch.bool))
+        target = uniform_box(count, (c.target_x, c.target_y, c.target_z), generator)
+        return Scene(target=target, cylinders=posts, batch_size=[count])
