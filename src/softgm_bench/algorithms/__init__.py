@@ -1,1 +1,1 @@
-"""Algorithms."""
+"""Algorithms: how a batch of frames improves a model."""

@@ -319,10 +319,13 @@ class SoftArmEnv(EnvBase):
 
     # what checkpoints need
 
-    @property
-    def generator(self) -> torch.Generator:
-        """The generator that scenes are drawn from."""
-        return self._generator
+    def generator_state(self) -> Tensor:
+        """State of the generator that scenes are drawn from."""
+        return self._generator.get_state()
+
+    def set_generator_state(self, state: Tensor) -> None:
+        """Go on drawing from what ``generator_state`` returned."""
+        self._generator.set_state(state)
 
     def simulation_state(self) -> TensorDict:
         """A copy of all episodes as they stand."""

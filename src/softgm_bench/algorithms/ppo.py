@@ -1,0 +1,143 @@
+"""Proximal policy optimisation for a team: one reward and one state value, one probability ratio per agent."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value import GAE
+
+from softgm_bench.envs import SoftArmEnv, keys
+from softgm_bench.models.heads import STATE_VALUE, ActorConfig, ValueConfig, build_actor, build_value
+
+ADVANTAGE, VALUE_TARGET = "advantage", "value_target"
+# What an update reads of a frame; everything else stays out of the minibatches.
+TRAINED_ON = (*keys.OBSERVATION, keys.ACTION, keys.LOG_PROB, ADVANTAGE, VALUE_TARGET)
+
+
+@dataclass
+class PPOConfig:
+    """Hyperparameters; values and meaning in ``conf/algo/softgm.yaml``."""
+
+    name: str
+    clip_epsilon: float
+    gamma: float
+    gae_lambda: float
+    entropy_coeff: float
+    critic_coeff: float
+    max_grad_norm: float
+    actor_lr: float
+    critic_lr: float
+    epochs: int
+    minibatch_size: int
+    normalize_advantage: bool
+    actor: ActorConfig
+    critic: ValueConfig
+
+
+class PPO:
+    """TorchRL's ``ClipPPOLoss`` and ``GAE`` with an optimiser each for actor and critic.
+
+    Attributes:
+        policy: what the collector and the evaluation call; shares its parameters with the loss.
+    """
+
+    def __init__(self, config: PPOConfig, model_config: Any, env: SoftArmEnv) -> None:
+        """Build networks, loss and optimisers for an environment's sizes and device."""
+        self.config = config
+        self.policy = build_actor(model_config, env.n_agents, env.n_slots, config.actor).to(env.device)
+        value = build_value(model_config, env.n_agents, env.n_slots, config.critic).to(env.device)
+        self.loss = ClipPPOLoss(
+            self.policy,
+            value,
+            clip_epsilon=config.clip_epsilon,
+            entropy_bonus=config.entropy_coeff > 0.0,
+            entropy_coeff=config.entropy_coeff,
+            critic_coeff=config.critic_coeff,
+            loss_critic_type="l2",
+            normalize_advantage=False,  # done once an iteration, over all of its frames
+        )
+        self.loss.set_keys(action=keys.ACTION, sample_log_prob=keys.LOG_PROB, value=STATE_VALUE)
+        # vmap over (now, next) would forbid the encoder's data-dependent shapes
+        self.advantage = GAE(
+            gamma=config.gamma, lmbda=config.gae_lambda, value_network=value, deactivate_vmap=True, average_gae=False
+        )
+        self._actor_parameters = list(self.policy.parameters())
+        self._critic_parameters = list(value.parameters())
+        self.actor_optimizer = torch.optim.Adam(self._actor_parameters, lr=config.actor_lr, eps=1e-5)
+        self.critic_optimizer = torch.optim.Adam(self._critic_parameters, lr=config.critic_lr, eps=1e-5)
+
+    def update(self, batch: TensorDictBase) -> dict[str, float]:
+        """Improve actor and critic on fresh frames.
+
+        Args:
+            batch: ``(num_envs, steps)`` consecutive frames of the current policy.
+
+        Returns:
+            Means over all minibatches of losses, entropy, KL divergence, clip fraction and gradient norms.
+        """
+        frames = self.prepare(batch)
+        totals: dict[str, Tensor] = {}
+        count = 0
+        for minibatch in self._minibatches(frames):
+            for name, value in self._step(minibatch).items():
+                totals[name] = totals.get(name, torch.zeros_like(value)) + value
+            count += 1
+        return {name: float(total) / count for name, total in totals.items()}
+
+    def prepare(self, batch: TensorDictBase) -> TensorDictBase:
+        """Estimate advantages and value targets, and flatten to frames ``(num_envs * steps,)``.
+
+        The team's advantage is given to every agent, ``(frames, N, 1)``: here and nowhere else.
+        """
+        with torch.no_grad():
+            batch = self.advantage(batch)
+        frames = batch.select(*TRAINED_ON).reshape(-1)
+        advantage = frames.get(ADVANTAGE)
+        if self.config.normalize_advantage:
+            advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+        n_agents = frames.get(keys.LOG_PROB).shape[-1]
+        return frames.set(ADVANTAGE, advantage.unsqueeze(-2).expand(-1, n_agents, 1))
+
+    def _minibatches(self, frames: TensorDictBase) -> Iterator[TensorDictBase]:
+        size = self.config.minibatch_size
+        for _ in range(self.config.epochs):
+            order = torch.randperm(len(frames), device=frames.device)
+            for chosen in order.split(size):
+                # a rest much smaller than a minibatch would weigh its few frames too much
+                if 2 * len(chosen) >= min(size, len(frames)):
+                    yield frames[chosen]
+
+    def _step(self, minibatch: TensorDictBase) -> dict[str, Tensor]:
+        losses = self.loss(minibatch)
+        total = losses["loss_objective"] + losses["loss_critic"]
+        if self.config.entropy_coeff > 0.0:
+            total = total + losses["loss_entropy"]
+        self.actor_optimizer.zero_grad(set_to_none=True)
+        self.critic_optimizer.zero_grad(set_to_none=True)
+        total.backward()
+        limit = self.config.max_grad_norm
+        actor_norm = torch.nn.utils.clip_grad_norm_(self._actor_parameters, limit)
+        critic_norm = torch.nn.utils.clip_grad_norm_(self._critic_parameters, limit)
+        self.actor_optimizer.step()
+        self.critic_optimizer.step()
+        names = ("loss_objective", "loss_critic", "loss_entropy", "entropy", "kl_approx", "clip_fraction")
+        metrics = {name: losses[name].detach() for name in names if name in losses.keys()}  # noqa: SIM118
+        return metrics | {"actor_grad_norm": actor_norm.detach(), "critic_grad_norm": critic_norm.detach()}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Networks and optimisers."""
+        return {
+            "loss": self.loss.state_dict(),
+            "actor_optimizer": self.actor_optimizer.state_dict(),
+            "critic_optimizer": self.critic_optimizer.state_dict(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from what ``state_dict`` returned."""
+        self.loss.load_state_dict(state["loss"])
+        self.actor_optimizer.load_state_dict(state["actor_optimizer"])
+        self.critic_optimizer.load_state_dict(state["critic_optimizer"])
