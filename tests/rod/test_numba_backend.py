@@ -157,3 +157,17 @@ def test_any_number_of_elements_agrees_with_the_reference(n_elements):
     found = NumbaBackend(parameters).control_step(straight_rods(parameters, 3), couple, cylinders=cylinders)
     expected = TorchBackend(parameters).control_step(straight_rods(parameters, 3), couple, cylinders=cylinders)
     assert torch.allclose(found.position, expected.position, rtol=0.0, atol=1e-11)
+
+
+@pytest.mark.parametrize("name", ["couple", "force", "active", "cylinders.mask", "state.position"])
+def test_shapes_that_do_not_fit_are_refused_before_the_kernel_reads_them(name):
+    backend, state = NumbaBackend(ARM), straight_rods(ARM, 2)
+    arguments = {"couple": random_couple(2), "force": None, "active": None, "cylinders": None}
+    if name == "state.position":
+        backend = NumbaBackend(RodParameters(n_elements=61))
+    elif name == "cylinders.mask":
+        arguments["cylinders"] = random_cylinders(3, 2)
+    else:
+        arguments[name] = torch.zeros(2, 3, 59, dtype=torch.float64)
+    with pytest.raises(ValueError, match=f"{name} has shape"):
+        backend.control_step(state, **arguments)

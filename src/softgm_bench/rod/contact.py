@@ -1,8 +1,8 @@
 """Contact between rods and fixed cylinders: PyElastica's penalty forces, and the geometric test of who touches.
 
 Vectors over elements keep PyElastica's layout, components before elements. A pair (cylinder, element) adds one
-dimension in front: ``(num_envs, n_cylinders, 3, n_elements)``. Everything is elementwise over environments, and the
-sum over cylinders is a fixed tree, so that no environment's result depends on its neighbours in the batch by even a bit.
+dimension in front: ``(num_envs, n_cylinders, 3, n_elements)``. There are no matrix products, whose rounding depends on
+the batch: on the CPU, no bit of an environment depends on its neighbours.
 """
 
 import math
@@ -74,7 +74,7 @@ def contact_forces(
     penetration = radius[:, None] + cylinder_radius - distance
     touching = cylinders.mask[:, :, None] & (penetration > 0.0)
     force = _pair_forces(gap, distance, penetration, approach, touching, parameters)
-    return -_elements_to_nodes(_tree_sum(force))
+    return -_elements_to_nodes(force.sum(1))
 
 
 def contact_nodes(position: Tensor, radius: Tensor, cylinders: Cylinders) -> Tensor:
@@ -205,22 +205,9 @@ def _existing(cylinders: Cylinders) -> tuple[Tensor, Tensor, Tensor]:
     return start[..., None], edge[..., None], radius
 
 
-def _tree_sum(force: Tensor) -> Tensor:
-    """Sum over cylinders, dimension 1, by adding neighbours.
-
-    ``torch.sum`` may add in an order that depends on the position in the batch; this order does not, nor does it depend
-    on how many masked cylinders pad the end.
-    """
-    while force.shape[1] > 1:
-        if force.shape[1] % 2:
-            force = torch.cat([force, torch.zeros_like(force[:, :1])], dim=1)
-        force = force[:, 0::2] + force[:, 1::2]
-    return force[:, 0]
-
-
 def _elements_to_nodes(force: Tensor) -> Tensor:
     """Give each element's force ``(num_envs, 3, n_elements)`` to its two nodes, the outermost ones 2/3 : 4/3."""
-    share = torch.ones_like(force[0, 0])
+    share = force.new_ones(force.shape[-1])
     first = torch.cat([share[:1] * (2.0 / 3.0), share[1:-1], share[-1:] * (4.0 / 3.0)])
     zero = torch.zeros_like(force[..., :1])
     return torch.cat([force * first, zero], dim=-1) + torch.cat([zero, force * first.flip(0)], dim=-1)

@@ -17,7 +17,7 @@ from softgm_bench.rod.numba_contact import COLUMNS, EDGE, NEXT_CHECK, RADIUS, ST
 from softgm_bench.rod.numba_kernel import jit, make_kernel
 from softgm_bench.rod.numba_layout import Layout, constant_rows, make_layout
 from softgm_bench.rod.parameters import RodParameters, rod_constants
-from softgm_bench.rod.state import Cylinders, RodState
+from softgm_bench.rod.state import Cylinders, RodState, check_inputs
 
 
 class NumbaBackend:
@@ -52,7 +52,11 @@ class NumbaBackend:
 
         Returns:
             A new state.
+
+        Raises:
+            ValueError: if the arguments' shapes do not fit together.
         """
+        check_inputs(self.parameters, state, couple, force, cylinders, active)
         dtype = state.position.dtype
         num_envs, n = couple.shape[0], self.parameters.n_elements
         rows, scalars, contact = self._table(dtype)

@@ -68,3 +68,35 @@ def dilatation(position: Tensor, rest_length: Tensor) -> Tensor:
     """Element lengths over rest lengths (Gazzola et al. 2018, eq. 3.3): ``(num_envs, n_elements)``."""
     edges = position[..., 1:] - position[..., :-1]
     return edges.norm(dim=-2) / rest_length
+
+
+def check_inputs(
+    parameters: RodParameters,
+    state: RodState,
+    couple: Tensor,
+    force: Tensor | None,
+    cylinders: Cylinders | None,
+    active: Tensor | None,
+) -> None:
+    """Refuse what does not fit together before any kernel reads it.
+
+    Raises:
+        ValueError: naming the first argument whose shape is wrong, and the right one.
+    """
+    num_envs, n = state.position.shape[0], parameters.n_elements
+    expected = {
+        "state.position": (state.position, (num_envs, 3, n + 1)),
+        "state.director": (state.director, (num_envs, 3, 3, n)),
+        "state.velocity": (state.velocity, (num_envs, 3, n + 1)),
+        "state.omega": (state.omega, (num_envs, 3, n)),
+        "couple": (couple, (num_envs, 3, n)),
+        "force": (force, (num_envs, 3, n + 1)),
+        "active": (active, (num_envs,)),
+        "cylinders.mask": (None if cylinders is None else cylinders.mask, (num_envs, -1)),
+    }
+    for name, (tensor, shape) in expected.items():
+        if tensor is None:
+            continue
+        fits = len(tensor.shape) == len(shape)
+        if not fits or any(size not in (-1, found) for found, size in zip(tensor.shape, shape, strict=True)):
+            raise ValueError(f"{name} has shape {tuple(tensor.shape)}: it must be {shape} for this rod and state")

@@ -1,8 +1,8 @@
 """Differentiable reference of the rod's motion: PyElastica 1.0.0's equations in batched PyTorch.
 
 Every function takes tensors whose first dimension is the environment and whose last is the node, element or Voronoi
-region. Only elementwise operations and sums over three components are used, so that an environment's result doesn't
-depend on its neighbours in the batch, bit for bit.
+region. There are no matrix products, whose rounding depends on the batch: on the CPU, no bit of an environment depends
+on its neighbours.
 """
 
 import math
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from softgm_bench.rod.contact import contact_forces, element_length, element_radius
 from softgm_bench.rod.parameters import RodParameters, rod_constants
-from softgm_bench.rod.state import Cylinders, RodState
+from softgm_bench.rod.state import Cylinders, RodState, check_inputs
 
 # Taylor coefficients, enough for float64's round-off below _SERIES_BELOW (a squared angle).
 _SERIES_BELOW = 0.09
@@ -83,11 +83,9 @@ class TorchBackend:
             A new state.
 
         Raises:
-            ValueError: if ``couple`` or ``force`` don't fit the state.
+            ValueError: if the arguments' shapes do not fit together.
         """
-        _require_shape("couple", couple, state.omega)
-        if force is not None:
-            _require_shape("force", force, state.velocity)
+        check_inputs(self.parameters, state, couple, force, cylinders, active)
         motion = Motion(state.position, state.director, state.velocity, state.omega)
         if active is None:
             moved = self._advance(motion, couple, force, cylinders, substeps)
@@ -273,7 +271,8 @@ def curvature(director: Tensor, constants: SimpleNamespace) -> Tensor:
     # R = Q_{k+1} Q_k^T has R_ij = following_i . here_j; summed over the columns of Q, this is its axis * 2 sin(theta).
     axis = torch.linalg.cross(following, here, dim=1).sum(2)
     trace = (here * following).sum(2).sum(1)
-    half_versine = ((3.0 - trace) * 0.25).clamp(0.0, 1.0)  # (1 - cos(theta)) / 2
+    # (1 - cos(theta)) / 2. Round-off may leave it negative, where PyElastica clips: the smooth function needs no clip.
+    half_versine = (3.0 - trace) * 0.25
     return 0.5 * angle_over_sine(half_versine)[:, None] * axis / constants.rest_voronoi_length
 
 
@@ -290,7 +289,7 @@ def sine_and_cosine_terms(square: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def angle_over_sine(half_versine: Tensor) -> Tensor:
-    """``theta / sin(theta)`` as a function of ``w = (1 - cos(theta)) / 2`` in [0, 1], smooth at 0.
+    """``theta / sin(theta)`` as a function of ``w = (1 - cos(theta)) / 2``, smooth at 0.
 
     PyElastica's ``arccos`` has no derivative at theta = 0; this function's is 2/3. It is finite at theta = pi.
     """
@@ -329,9 +328,3 @@ def _polynomial(coefficients: tuple[float, ...], x: Tensor) -> Tensor:
     for coefficient in coefficients[-2::-1]:
         value = value * x + coefficient
     return value
-
-
-def _require_shape(name: str, tensor: Tensor, like: Tensor) -> None:
-    """Raise a ``ValueError`` that names the tensor if its shape isn't that of ``like``."""
-    if tensor.shape != like.shape:
-        raise ValueError(f"{name} has shape {tuple(tensor.shape)}: the state needs {tuple(like.shape)}")

@@ -1,0 +1,144 @@
+"""PyElastica 1.0.0 as the oracle of a rod's trajectory."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import NamedTuple
+
+import elastica as ea
+import elastica.contact_forces
+import numpy as np
+from numpy.typing import NDArray
+
+from softgm_bench.rod.parameters import RodParameters
+
+Array = NDArray[np.float64]
+
+
+class Post(NamedTuple):
+    start: tuple[float, float, float]
+    axis: tuple[float, float, float]
+    length: float
+    radius: float
+
+
+class Trajectory(NamedTuple):
+    """One entry per control step, taken at its end."""
+
+    position: Array  # (steps, 3, n_nodes)
+    director: Array  # (steps, 3, 3, n_elements)
+    velocity: Array  # (steps, 3, n_nodes)
+    omega: Array  # (steps, 3, n_elements)
+    contact_force: Array  # (steps,), the largest force of any cylinder on any node within the step, N
+
+
+class _Simulator(ea.BaseSystemCollection, ea.Constraints, ea.Forcing, ea.Damping, ea.Contact):
+    pass
+
+
+class _Loads(ea.NoForces):
+    """The couple of the current control step and a constant force."""
+
+    def __init__(self, couple: Array, force: Array | None):
+        super().__init__()
+        self.couple, self.force = couple, force
+
+    def apply_forces(self, system, time=0.0):
+        if self.force is not None:
+            system.external_forces += self.force
+
+    def apply_torques(self, system, time=0.0):
+        system.external_torques += self.couple
+
+
+class _LargestContactForce(ea.NoForces):
+    """Appended after the contacts: notes how much they added to the loads."""
+
+    def __init__(self, record: list[float], loads: Array):
+        super().__init__()
+        self.record, self.loads = record, loads
+
+    def apply_forces(self, system, time=0.0):
+        self.record[-1] = max(self.record[-1], float(np.abs(system.external_forces - self.loads).max()))
+
+
+@contextmanager
+def _without_pruning() -> Iterator[None]:
+    """PyElastica skips cylinders by bounding boxes, which miss contacts: compute every pair instead."""
+    original = elastica.contact_forces._prune_using_aabbs_rod_cylinder
+    elastica.contact_forces._prune_using_aabbs_rod_cylinder = lambda *arguments: 0
+    try:
+        yield
+    finally:
+        elastica.contact_forces._prune_using_aabbs_rod_cylinder = original
+
+
+def straight_rod(parameters: RodParameters) -> ea.CosseratRod:
+    return ea.CosseratRod.straight_rod(
+        parameters.n_elements,
+        np.zeros(3),
+        np.array([0.0, 0.0, 1.0]),
+        np.array([0.0, 1.0, 0.0]),
+        parameters.base_length,
+        parameters.base_radius,
+        parameters.density,
+        youngs_modulus=parameters.youngs_modulus,
+        shear_modulus=parameters.shear_modulus,
+    )
+
+
+def simulate(
+    parameters: RodParameters,
+    couple: Callable[[int], Array],
+    steps: int,
+    posts: Sequence[Post] = (),
+    force: Array | None = None,
+) -> Trajectory:
+    """Run ``steps`` control steps; ``couple(step)`` is ``(3, n_elements)`` and ``force`` ``(3, n_nodes)``."""
+    simulator, rod = _Simulator(), straight_rod(parameters)
+    simulator.append(rod)
+    simulator.constrain(rod).using(ea.OneEndFixedBC, constrained_position_idx=(0,), constrained_director_idx=(0,))
+    simulator.dampen(rod).using(
+        ea.AnalyticalLinearDamper,
+        time_step=parameters.dt,
+        **{parameters.damping_protocol: parameters.damping_constant},
+    )
+    # The loads' couple changes in place between control steps.
+    current = np.zeros((3, parameters.n_elements))
+    loads = np.array(parameters.gravity)[:, None] * rod.mass + (0.0 if force is None else force)
+    simulator.add_forcing_to(rod).using(ea.GravityForces, acc_gravity=np.array(parameters.gravity))
+    simulator.add_forcing_to(rod).using(_Loads, couple=current, force=force)
+    for post in posts:
+        _add_fixed_cylinder(simulator, rod, post, parameters)
+    largest: list[float] = []
+    simulator.add_forcing_to(rod).using(_LargestContactForce, record=largest, loads=loads)
+    simulator.finalize()
+
+    stepper, time, states = ea.PositionVerlet(), np.float64(0.0), []
+    with _without_pruning():
+        for step in range(steps):
+            current[...] = couple(step)
+            largest.append(0.0)
+            for _ in range(parameters.substeps):
+                time = stepper.step(simulator, time, np.float64(parameters.dt))
+            collections = (rod.position_collection, rod.director_collection, rod.velocity_collection)
+            states.append([array.copy() for array in (*collections, rod.omega_collection)])
+    position, director, velocity, omega = (np.stack(series) for series in zip(*states, strict=True))
+    return Trajectory(position, director, velocity, omega, np.array(largest))
+
+
+def _add_fixed_cylinder(simulator: _Simulator, rod: ea.CosseratRod, post: Post, parameters: RodParameters) -> None:
+    axis = np.array(post.axis)
+    normal = np.eye(3)[np.abs(axis).argmin()]
+    normal = normal - (normal @ axis) * axis
+    cylinder = ea.Cylinder(
+        np.array(post.start), axis, normal / np.linalg.norm(normal), post.length, post.radius, density=1000.0
+    )
+    simulator.append(cylinder)
+    simulator.constrain(cylinder).using(ea.OneEndFixedBC, constrained_position_idx=(0,), constrained_director_idx=(0,))
+    simulator.detect_contact_between(rod, cylinder).using(
+        ea.RodCylinderContact,
+        k=parameters.contact_stiffness,
+        nu=parameters.contact_damping,
+        velocity_damping_coefficient=parameters.velocity_damping_coefficient,
+        friction_coefficient=parameters.friction_coefficient,
+    )
