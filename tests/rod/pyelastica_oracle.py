@@ -35,19 +35,24 @@ class _Simulator(ea.BaseSystemCollection, ea.Constraints, ea.Forcing, ea.Damping
     pass
 
 
-class _Loads(ea.NoForces):
-    """The couple of the current control step and a constant force."""
+class Loads:
+    """The couple of the current control step, changed in place, and a constant force."""
 
-    def __init__(self, couple: Array, force: Array | None):
-        super().__init__()
+    def __init__(self, couple: Array, force: Array | None = None):
         self.couple, self.force = couple, force
 
+
+class _Given(ea.NoForces):
+    def __init__(self, loads: Loads):
+        super().__init__()
+        self.loads = loads
+
     def apply_forces(self, system, time=0.0):
-        if self.force is not None:
-            system.external_forces += self.force
+        if self.loads.force is not None:
+            system.external_forces += self.loads.force
 
     def apply_torques(self, system, time=0.0):
-        system.external_torques += self.couple
+        system.external_torques += self.loads.couple
 
 
 class _LargestContactForce(ea.NoForces):
@@ -86,14 +91,8 @@ def straight_rod(parameters: RodParameters) -> ea.CosseratRod:
     )
 
 
-def simulate(
-    parameters: RodParameters,
-    couple: Callable[[int], Array],
-    steps: int,
-    posts: Sequence[Post] = (),
-    force: Array | None = None,
-) -> Trajectory:
-    """Run ``steps`` control steps; ``couple(step)`` is ``(3, n_elements)`` and ``force`` ``(3, n_nodes)``."""
+def build(parameters: RodParameters, loads: Loads, posts: Sequence[Post] = ()) -> tuple[_Simulator, ea.CosseratRod]:
+    """A simulator that still has to be finalised: the arm with its clamp, damper, loads and contacts, no more."""
     simulator, rod = _Simulator(), straight_rod(parameters)
     simulator.append(rod)
     simulator.constrain(rod).using(ea.OneEndFixedBC, constrained_position_idx=(0,), constrained_director_idx=(0,))
@@ -102,21 +101,33 @@ def simulate(
         time_step=parameters.dt,
         **{parameters.damping_protocol: parameters.damping_constant},
     )
-    # The loads' couple changes in place between control steps.
-    current = np.zeros((3, parameters.n_elements))
-    loads = np.array(parameters.gravity)[:, None] * rod.mass + (0.0 if force is None else force)
-    simulator.add_forcing_to(rod).using(ea.GravityForces, acc_gravity=np.array(parameters.gravity))
-    simulator.add_forcing_to(rod).using(_Loads, couple=current, force=force)
+    if any(parameters.gravity):
+        simulator.add_forcing_to(rod).using(ea.GravityForces, acc_gravity=np.array(parameters.gravity))
+    simulator.add_forcing_to(rod).using(_Given, loads=loads)
     for post in posts:
         _add_fixed_cylinder(simulator, rod, post, parameters)
+    return simulator, rod
+
+
+def simulate(
+    parameters: RodParameters,
+    couple: Callable[[int], Array],
+    steps: int,
+    posts: Sequence[Post] = (),
+    force: Array | None = None,
+) -> Trajectory:
+    """Run ``steps`` control steps; ``couple(step)`` is ``(3, n_elements)`` and ``force`` ``(3, n_nodes)``."""
+    loads = Loads(np.zeros((3, parameters.n_elements)), force)
+    simulator, rod = build(parameters, loads, posts)
+    constant = np.array(parameters.gravity)[:, None] * rod.mass + (0.0 if force is None else force)
     largest: list[float] = []
-    simulator.add_forcing_to(rod).using(_LargestContactForce, record=largest, loads=loads)
+    simulator.add_forcing_to(rod).using(_LargestContactForce, record=largest, loads=constant)
     simulator.finalize()
 
     stepper, time, states = ea.PositionVerlet(), np.float64(0.0), []
     with _without_pruning():
         for step in range(steps):
-            current[...] = couple(step)
+            loads.couple[...] = couple(step)
             largest.append(0.0)
             for _ in range(parameters.substeps):
                 time = stepper.step(simulator, time, np.float64(parameters.dt))

@@ -1,1 +1,23 @@
-"""Models."""
+"""Encoders from the observation to one embedding per agent, and the heads that make actors and critics of them.
+
+They know the environment only through the names of its entries (``envs.keys``).
+"""
+
+from softgm_bench.models.heads import ActorConfig, ValueConfig, build_actor, build_value
+from softgm_bench.models.mlp import MLPConfig, MLPEncoder
+from softgm_bench.models.registry import build_encoder, model_configs, register_model
+from softgm_bench.models.softgm import SoftGMConfig, SoftGMEncoder
+
+__all__ = [
+    "ActorConfig",
+    "MLPConfig",
+    "MLPEncoder",
+    "SoftGMConfig",
+    "SoftGMEncoder",
+    "ValueConfig",
+    "build_actor",
+    "build_encoder",
+    "build_value",
+    "model_configs",
+    "register_model",
+]

@@ -94,14 +94,27 @@ def contact_nodes(position: Tensor, radius: Tensor, cylinders: Cylinders) -> Ten
     node_radius = 0.5 * (
         torch.cat([radius[:, :1], radius], dim=-1) + torch.cat([radius, radius[:, -1:]], dim=-1)
     )  # (num_envs, n_nodes); the end nodes count their one element twice
+    env, cylinder = _boxes_overlap(position, node_radius, cylinders).nonzero(as_tuple=True)
     distance = point_segment_distance(
-        position.transpose(-1, -2)[:, None],
-        cylinders.start[:, :, None],
-        cylinders.axis[:, :, None],
-        cylinders.length[:, :, None],
+        position[env].transpose(-1, -2),
+        cylinders.start[env, cylinder].unsqueeze(1),
+        cylinders.axis[env, cylinder].unsqueeze(1),
+        cylinders.length[env, cylinder].unsqueeze(1),
     )
-    touches = distance < node_radius[:, None] + cylinders.radius[:, :, None]
-    return (touches & cylinders.mask[:, :, None]).any(dim=1)
+    touches = distance < node_radius[env] + cylinders.radius[env, cylinder].unsqueeze(1)  # (pairs, n_nodes)
+    count = torch.zeros(node_radius.shape, dtype=torch.int32, device=position.device)
+    return count.index_add_(0, env, touches.to(torch.int32)) > 0
+
+
+def _boxes_overlap(position: Tensor, node_radius: Tensor, cylinders: Cylinders) -> Tensor:
+    """Pairs of rod and existing cylinder that may touch, ``(num_envs, n_cylinders)``: their bounding boxes meet."""
+    thickness = node_radius.amax(dim=-1, keepdim=True)
+    rod_low, rod_high = position.amin(dim=-1) - thickness, position.amax(dim=-1) + thickness
+    end = cylinders.start + cylinders.axis * cylinders.length.unsqueeze(-1)
+    low = torch.minimum(cylinders.start, end) - cylinders.radius.unsqueeze(-1)
+    high = torch.maximum(cylinders.start, end) + cylinders.radius.unsqueeze(-1)
+    apart = (low > rod_high.unsqueeze(1)) | (high < rod_low.unsqueeze(1))
+    return cylinders.mask & ~apart.any(dim=-1)
 
 
 def point_segment_distance(point: Tensor, start: Tensor, axis: Tensor, length: Tensor) -> Tensor:

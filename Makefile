@@ -1,0 +1,30 @@
+# From a fresh clone, `make train` or `make test` is enough: each sets up what it needs first.
+PYTHON ?= python3.11
+BIN := .venv/bin
+STAMP := .venv/.setup
+
+.PHONY: setup train test test-slow check bench
+
+setup: $(STAMP)
+
+$(STAMP): pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev]'
+	touch $@
+
+train: setup
+	$(BIN)/python -m softgm_bench algo=softgm task=basic seed=0 experiment=quick
+
+test: setup
+	$(BIN)/python -m pytest
+
+test-slow: setup
+	$(BIN)/python -m pytest -m slow
+
+check: setup
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+
+bench: setup
+	$(BIN)/python benchmarks/bench_rod.py

@@ -1,0 +1,221 @@
+"""The settings of a run: their types, how they are composed from ``conf/`` and what they must satisfy.
+
+Values live in YAML only, except the arm's, whose dataclass is the source. Hydra composes the YAML; ``typed`` then holds
+it against the dataclasses, so a misspelt key or a wrong type is refused wherever it was written.
+"""
+
+import os
+import re
+from dataclasses import asdict, dataclass, fields, is_dataclass
+from pathlib import Path
+from typing import Any, get_origin, get_type_hints
+
+from hydra import compose as hydra_compose
+from hydra import initialize_config_dir
+from hydra.core.config_store import ConfigStore
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from softgm_bench.rod.parameters import RodParameters
+
+
+class UserError(Exception):
+    """Something that the user can put right; the message is one line that says what, where and how."""
+
+
+@dataclass
+class EvaluationConfig:
+    """When and how the policy is evaluated; see ``conf/experiment/default.yaml``."""
+
+    interval: int
+    episodes: int
+    final_episodes: int
+    deterministic: bool
+    horizon: int | None
+
+
+@dataclass
+class CheckpointConfig:
+    """When checkpoints are written; see ``conf/experiment/default.yaml``."""
+
+    interval: int
+    keep: int
+
+
+@dataclass
+class ExperimentConfig:
+    """How long to train and how often to look; see ``conf/experiment/default.yaml``."""
+
+    total_frames: int
+    num_envs: int
+    steps_per_batch: int
+    train_horizon: int | None
+    evaluation: EvaluationConfig
+    checkpoint: CheckpointConfig
+
+
+@dataclass
+class Config:
+    """Everything that a run depends on; see ``conf/config.yaml``.
+
+    ``task``, ``algo`` and ``model`` are instances of the dataclass that the key ``name`` in their YAML stands for.
+    """
+
+    seed: int
+    device: str
+    backend: str
+    threads: int | None
+    run_dir: str
+    overwrite: bool
+    task: Any
+    algo: Any
+    model: Any
+    rod: RodParameters
+    experiment: ExperimentConfig
+
+
+# The arm's YAML is written by its dataclass, so that its values stand in one place.
+ConfigStore.instance().store(group="rod", name="paper", node=asdict(RodParameters()))
+
+
+def config_directory() -> Path:
+    """Folder of the YAML files: inside an installed package, or at the top of the repository."""
+    package = Path(__file__).resolve().parent
+    installed = package / "conf"
+    return installed if installed.is_dir() else package.parents[1] / "conf"
+
+
+def compose(overrides: list[str]) -> Config:
+    """The configuration that ``python -m softgm_bench <overrides>`` runs with, checked.
+
+    Raises:
+        UserError: a value that makes no sense.
+        HydraException, OmegaConfBaseException: an override that cannot be read, a misspelt key or a wrong type.
+    """
+    config = typed(compose_untyped(overrides))
+    validate(config)
+    return config
+
+
+def compose_untyped(overrides: list[str]) -> DictConfig:
+    """What the YAML files and the overrides say, before it is held against the dataclasses."""
+    with initialize_config_dir(version_base="1.3", config_dir=str(config_directory())):
+        return hydra_compose("config", overrides)
+
+
+def typed(composed: DictConfig) -> Config:
+    """Hold a composed configuration against the dataclasses and make instances of them."""
+    schema, values = _schema(Config), composed.copy()
+    OmegaConf.set_struct(values, False)
+    for group, schemas in _group_schemas().items():
+        name = OmegaConf.select(composed, f"{group}.name")
+        if name not in schemas:
+            raise UserError(f"{group}.name={name}: no such {group}; choose one of {', '.join(schemas)}")
+        schema[group] = _schema(schemas[name])
+        if "name" not in get_type_hints(schemas[name]):
+            del values[group]["name"]
+    merged = OmegaConf.merge(schema, values)
+    try:
+        config = OmegaConf.to_object(merged)
+    except OmegaConfBaseException:
+        raise
+    except ValueError as error:  # a dataclass refuses its values with one line
+        raise UserError(str(error)) from error
+    assert isinstance(config, Config)
+    _restore_tuples(config)
+    return config
+
+
+def plain(config: Config) -> dict[str, Any]:
+    """The configuration as plain values; ``typed(OmegaConf.create(plain(config)))`` gives it back."""
+    values = asdict(config)
+    for group, schemas in _group_schemas().items():
+        names = {schema: name for name, schema in schemas.items()}
+        values[group] = {"name": names[type(getattr(config, group))]} | values[group]
+    return values
+
+
+def validate(config: Config) -> None:
+    """Refuse settings that have the right types and make no sense.
+
+    Raises:
+        UserError: naming the first such key, its value and what would be right.
+    """
+    experiment, evaluation, checkpoint = config.experiment, config.experiment.evaluation, config.experiment.checkpoint
+    if not 0 <= config.seed < 2**63:
+        raise UserError(f"seed={config.seed}: a seed is a whole number from 0 to 2**63 - 1")
+    at_least_one = {
+        "experiment.total_frames": experiment.total_frames,
+        "experiment.num_envs": experiment.num_envs,
+        "experiment.steps_per_batch": experiment.steps_per_batch,
+        "experiment.train_horizon": experiment.train_horizon,
+        "experiment.evaluation.interval": evaluation.interval,
+        "experiment.evaluation.episodes": evaluation.episodes,
+        "experiment.evaluation.final_episodes": evaluation.final_episodes,
+        "experiment.evaluation.horizon": evaluation.horizon,
+        "experiment.checkpoint.interval": checkpoint.interval,
+        "experiment.checkpoint.keep": checkpoint.keep,
+    }
+    for key, value in at_least_one.items():
+        if value is not None and value < 1:
+            raise UserError(f"{key}={value}: it must be at least 1")
+    if not config.run_dir:
+        raise UserError("run_dir is empty: name a folder for the run")
+    _validate_machine(config)
+
+
+def available_threads() -> int:
+    """Number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _validate_machine(config: Config) -> None:
+    import torch
+
+    from softgm_bench.rod.backend import BACKENDS
+
+    cores = available_threads()
+    if config.threads is not None and not 1 <= config.threads <= cores:
+        raise UserError(f"threads={config.threads}: choose 1 to {cores}, the cores of this machine, or null")
+    if config.backend not in BACKENDS:
+        raise UserError(f"backend={config.backend}: choose one of {', '.join(BACKENDS)}")
+    device = re.fullmatch(r"cpu|cuda(?::(\d+))?", config.device)
+    if device is None:
+        raise UserError(f"device={config.device}: choose cpu, cuda or cuda:<index>")
+    if config.device == "cpu":
+        return
+    if config.backend == "numba":
+        raise UserError(f"device={config.device}: backend=numba runs on the CPU; add backend=torch")
+    if int(device.group(1) or 0) >= torch.cuda.device_count():
+        raise UserError(f"device={config.device}: this machine has {torch.cuda.device_count()} CUDA devices")
+
+
+def _group_schemas() -> dict[str, dict[str, type]]:
+    """Dataclass of every task, algorithm and model by name; imported late because it brings torch along."""
+    from softgm_bench.algorithms.ppo import PPOConfig
+    from softgm_bench.envs.tasks import TASK_CONFIGS
+    from softgm_bench.models.registry import model_configs
+
+    return {"task": TASK_CONFIGS, "algo": {"softgm": PPOConfig}, "model": model_configs()}
+
+
+def _schema(cls: type) -> DictConfig:
+    """Structured config of a dataclass; OmegaConf would keep a frozen one read-only, even while merging."""
+    node = OmegaConf.structured(cls)
+    OmegaConf.set_readonly(node, False)
+    hints = get_type_hints(cls)
+    for field in fields(cls):
+        if is_dataclass(hints[field.name]):
+            node[field.name] = _schema(hints[field.name])
+    return node
+
+
+def _restore_tuples(instance: Any) -> None:
+    """Turn the lists that OmegaConf leaves in fields of type tuple back, so that frozen dataclasses can be hashed."""
+    hints = get_type_hints(type(instance))
+    for field in fields(instance):
+        value = getattr(instance, field.name)
+        if is_dataclass(value):
+            _restore_tuples(value)
+        elif get_origin(hints[field.name]) is tuple:
+            object.__setattr__(instance, field.name, tuple(value))

@@ -1,0 +1,110 @@
+"""Vectorised evaluation: every environment counts exactly its first episode."""
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
+
+from softgm_bench.envs import keys
+
+DISCOUNT = 0.99  # of the returns that are reported, whatever an algorithm trains with
+
+
+@dataclass(frozen=True)
+class EpisodeRecords:
+    """One entry per episode in every field, ``(episodes,)``.
+
+    Attributes:
+        discounted_return: sum of gamma^t r_t.
+        undiscounted_return: sum of r_t.
+        length: control steps.
+        success: whether the tip reached the target.
+        diverged: whether the simulation broke; never a success.
+        tip_travel_distance: length of the tip's path, m.
+        final_distance: tip to target at the end, m.
+        torque_per_agent: mean over steps and agents of an agent's torque, N m.
+        torque_joint: mean over steps of the norm over all agents and axes, N m.
+    """
+
+    discounted_return: NDArray[np.float64]
+    undiscounted_return: NDArray[np.float64]
+    length: NDArray[np.int64]
+    success: NDArray[np.bool_]
+    diverged: NDArray[np.bool_]
+    tip_travel_distance: NDArray[np.float64]
+    final_distance: NDArray[np.float64]
+    torque_per_agent: NDArray[np.float64]
+    torque_joint: NDArray[np.float64]
+
+    def rows(self) -> list[dict[str, float | int]]:
+        """One mapping per episode, of plain numbers."""
+        columns = {name: values.tolist() for name, values in asdict(self).items()}
+        return [
+            {"episode": index} | {name: values[index] for name, values in columns.items()}
+            for index in range(len(self.length))
+        ]
+
+
+def evaluate(
+    policy: TensorDictModuleBase, env: EnvBase, *, deterministic: bool, seed: int, gamma: float = DISCOUNT
+) -> EpisodeRecords:
+    """One episode in each of ``env``'s environments; the same seed gives the same episodes.
+
+    Training is not disturbed: ``env`` must not be the training environment, and the global generator, on which a
+    policy that samples draws, is put back.
+    """
+    exploration = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
+    devices = [env.device] if env.device is not None and env.device.type == "cuda" else []
+    with torch.random.fork_rng(devices), torch.no_grad(), set_exploration_type(exploration):
+        env.set_seed(seed)
+        torch.manual_seed(seed)
+        return _first_episodes(policy, env, gamma)
+
+
+def _first_episodes(policy: TensorDictModuleBase, env: EnvBase, gamma: float) -> EpisodeRecords:
+    data = env.reset()
+    alive = torch.ones(env.batch_size, dtype=torch.bool, device=env.device)
+    summed = {
+        "discounted_return": keys.REWARD,
+        "undiscounted_return": keys.REWARD,
+        "tip_travel_distance": keys.TIP_STEP,
+        "torque_per_agent": keys.TORQUE_PER_AGENT,
+        "torque_joint": keys.TORQUE_JOINT,
+    }
+    sums = {name: torch.zeros(env.batch_size, dtype=torch.float64, device=env.device) for name in summed}
+    length = torch.zeros(env.batch_size, dtype=torch.int64, device=env.device)
+    success, diverged = torch.zeros_like(alive), torch.zeros_like(alive)
+    distance = torch.zeros_like(sums["torque_joint"])
+    discount = 1.0
+    while alive.any():
+        data = env.step(_act(policy, data, alive))
+        after = data["next"]
+        for name, key in summed.items():
+            weight = discount if name == "discounted_return" else 1.0
+            sums[name] += torch.where(alive, weight * after[key].squeeze(-1).double(), 0.0)
+        length += alive
+        success |= alive & after[keys.SUCCESS].squeeze(-1)
+        diverged |= alive & after[keys.DIVERGED].squeeze(-1)
+        distance = torch.where(alive, after[keys.DISTANCE].squeeze(-1).double(), distance)
+        alive = alive & ~after[keys.DONE].squeeze(-1)
+        discount *= gamma
+        data = step_mdp(data)
+    for name in ("torque_per_agent", "torque_joint"):
+        sums[name] /= length
+    results = sums | {"length": length, "success": success, "diverged": diverged, "final_distance": distance}
+    return EpisodeRecords(**{name: value.cpu().numpy() for name, value in results.items()})
+
+
+def _act(policy: TensorDictModuleBase, data: TensorDictBase, alive: torch.Tensor) -> TensorDictBase:
+    """Actions of the environments whose first episode goes on; zeros, unpaid for, in the others."""
+    if alive.all():
+        return policy(data)
+    action = policy(data[alive])[keys.ACTION]
+    data[keys.ACTION] = action.new_zeros(*alive.shape, *action.shape[1:])
+    data[keys.ACTION][alive] = action
+    return data

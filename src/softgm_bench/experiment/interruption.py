@@ -1,0 +1,61 @@
+"""Ctrl-C and SIGTERM end a run where its state is whole, so that the checkpoint written then can be gone on from."""
+
+import os
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any, Self
+
+
+class Interrupted(KeyboardInterrupt):
+    """The run was told to stop; the message says where its checkpoint is."""
+
+    def __init__(self, signal_number: int) -> None:
+        """Remember the signal for the exit code."""
+        super().__init__()
+        self.exit_code = 128 + signal_number
+
+
+class Interruption:
+    """While entered, the first SIGINT or SIGTERM waits for ``check`` or ``at_once``; a second stops anywhere."""
+
+    def __init__(self) -> None:
+        """Nothing has arrived yet."""
+        self._received: int | None = None
+        self._at_once = False
+        self._previous: dict[int, Any] = {}
+
+    def __enter__(self) -> Self:
+        """Begin to listen."""
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._previous[number] = signal.signal(number, self._receive)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Put the previous handlers back."""
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+    def check(self) -> None:
+        """Stop here if a signal has arrived."""
+        if self._received is not None:
+            raise Interrupted(self._received)
+
+    @contextmanager
+    def at_once(self) -> Iterator[None]:
+        """Around work that may be broken off anywhere, such as an evaluation."""
+        self._at_once = True
+        try:
+            self.check()
+            yield
+        finally:
+            self._at_once = False
+
+    def _receive(self, number: int, frame: FrameType | None) -> None:
+        if self._at_once:
+            raise Interrupted(number)
+        if self._received is not None:
+            raise KeyboardInterrupt("stopped at once; only earlier checkpoints are left")
+        self._received = number
+        os.write(2, b"\nstopping after this iteration; once more to stop at once\n")  # print may be under way itself

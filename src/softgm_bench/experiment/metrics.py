@@ -1,0 +1,94 @@
+"""What is written during training: ``metrics.csv``, one row an iteration, and the statistics of its episodes."""
+
+import csv
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import torch
+from tensordict import TensorDictBase
+
+from softgm_bench.envs import keys
+
+Row = Mapping[str, float | int]
+
+
+class CsvWriter:
+    """Appends rows to a new CSV file, each on disk before the next begins. The first row names the columns."""
+
+    def __init__(self, path: Path) -> None:
+        """Create the file, or empty it."""
+        self._file = path.open("w", newline="")
+        self._writer: csv.DictWriter | None = None
+
+    def write(self, row: Row) -> None:
+        """Append a row; it must have the columns of the first."""
+        if self._writer is None:
+            self._writer = csv.DictWriter(self._file, list(row), lineterminator="\n")
+            self._writer.writeheader()
+        if row.keys() != set(self._writer.fieldnames):
+            raise ValueError(f"columns changed: {sorted(row.keys() ^ set(self._writer.fieldnames))}")
+        self._writer.writerow(row)
+        self._file.flush()
+
+    def __enter__(self) -> Self:
+        """The writer itself."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+class EpisodeTracker:
+    """Return and length of the episodes under way, one per environment, across batches of steps."""
+
+    def __init__(self, num_envs: int, device: str) -> None:
+        """Every environment is at the start of an episode."""
+        self._return = torch.zeros(num_envs, dtype=torch.float64, device=device)
+        self._length = torch.zeros(num_envs, dtype=torch.int64, device=device)
+
+    def update(self, batch: TensorDictBase) -> dict[str, float | int]:
+        """Statistics of the episodes that end within ``batch``, whose shape is ``(num_envs, steps)``.
+
+        Without any such episode the means are NaN.
+        """
+        after = batch["next"]
+        reward, done = after[keys.REWARD].squeeze(-1), after[keys.DONE].squeeze(-1)
+        returns, lengths = [], []
+        for step in range(batch.shape[1]):
+            self._return += reward[:, step]
+            self._length += 1
+            returns.append(self._return.clone())
+            lengths.append(self._length.clone())
+            self._return[done[:, step]] = 0.0
+            self._length[done[:, step]] = 0
+        success, diverged = (after[key].squeeze(-1)[done] for key in (keys.SUCCESS, keys.DIVERGED))
+        return {
+            "episodes": int(done.sum()),
+            "episode_return": torch.stack(returns, 1)[done].mean().item(),
+            "episode_length": torch.stack(lengths, 1)[done].double().mean().item(),
+            "success_rate": success.double().mean().item(),
+            "diverged": int(diverged.sum()),
+        }
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        """What the episodes under way have gathered."""
+        return {"return": self._return, "length": self._length}
+
+
+def step_metrics(batch: TensorDictBase) -> dict[str, float]:
+    """Means over all steps of a batch: every reward term, contact, sensing and torque."""
+    after = batch["next"]
+    means = {f"reward_{name}": after[keys.REWARD_TERMS, name] for name in keys.REWARD_TERM_NAMES}
+    means |= {
+        "tip_distance": after[keys.DISTANCE],
+        "contact_nodes": after[keys.CONTACT_NODES],
+        "discovered_bins": after[keys.DISCOVERED],
+        "torque_per_agent": after[keys.TORQUE_PER_AGENT],
+        "torque_joint": after[keys.TORQUE_JOINT],
+    }
+    row = {name: value.double().mean().item() for name, value in means.items()}
+    row["dropped_bins"] = after[keys.DROPPED].max().item()
+    return row

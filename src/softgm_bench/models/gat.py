@@ -1,0 +1,184 @@
+"""Multi-head graph attention (paper, section "Attention-based Message Passing"; Velickovic et al. 2018).
+
+One set of parameters, three forms of the same layer:
+
+- ``forward``: dense and masked, for any adjacency; the plain reference;
+- ``entity_to_agent``: an edge list from obstacle nodes to agents, plus the agents' self-loops (stage 1);
+- ``chain``: neighbours on a chain plus self-loops (stage 2).
+
+The GAT score ``a^T [u_i || u_j]`` is split into ``a_target^T u_i + a_source^T u_j``, so no pairwise feature tensor
+exists. Segment operations are ``index_add`` and ``scatter_reduce("amax")``: deterministic on CPU.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+NEGATIVE_SLOPE = 0.2  # of LeakyReLU, as in Velickovic et al. 2018; the paper gives none
+
+
+class Projection(NamedTuple):
+    """What attention needs of every node: C = out_features / heads channels a head.
+
+    Attributes:
+        message: u, ``(..., H, C)``.
+        source: the node's part of a score as a source: ``(..., H)``, for GATv2 ``(..., H, C)``.
+        target: the same as a target; None for nodes that receive nothing.
+    """
+
+    message: Tensor
+    source: Tensor
+    target: Tensor | None
+
+
+class GraphAttention(nn.Module):
+    """Heads concatenated, then a bias (the paper's formula has none; the reference GAT does)."""
+
+    def __init__(self, in_features: int, out_features: int, heads: int, gatv2: bool) -> None:
+        """Draw the parameters.
+
+        Args:
+            in_features: of a node.
+            out_features: of a node, over all heads.
+            heads: number of heads; divides ``out_features``.
+            gatv2: scores ``a^T LeakyReLU(W_target h_i + W h_j)`` (Brody et al. 2022, eq. 7) instead of the paper's.
+
+        Raises:
+            ValueError: if ``heads`` does not divide ``out_features``.
+        """
+        super().__init__()
+        if out_features % heads:
+            raise ValueError(f"out_features={out_features} is not a multiple of heads={heads}")
+        self.heads, self.channels, self.gatv2 = heads, out_features // heads, gatv2
+        self.weight = nn.Parameter(torch.empty(out_features, in_features))
+        self.source = nn.Parameter(torch.empty(heads, self.channels))
+        # GATv2 has one attention vector after the nonlinearity, and a second transform for targets before it.
+        self.target = nn.Parameter(torch.empty((out_features, in_features) if gatv2 else (heads, self.channels)))
+        self.bias = nn.Parameter(torch.zeros(out_features))
+        for parameter in (self.weight, self.source, self.target):
+            nn.init.xavier_uniform_(parameter)
+
+    def forward(self, nodes: Tensor, adjacency: Tensor) -> tuple[Tensor, Tensor]:
+        """Dense reference.
+
+        Args:
+            nodes: ``(..., V, in_features)``.
+            adjacency: bool, incoming, with self-loops, broadcasts to ``(..., V, V)``: row = target.
+
+        Returns:
+            New nodes ``(..., V, out_features)`` and attention weights ``(..., H, V, V)``.
+        """
+        message = (nodes @ self.weight.mT).unflatten(-1, (self.heads, self.channels))
+        if self.gatv2:
+            target = (nodes @ self.target.mT).unflatten(-1, (self.heads, self.channels))
+            scores = self._score(target.unsqueeze(-3) + message.unsqueeze(-4))
+        else:
+            target, source = (message * self.target).sum(-1), (message * self.source).sum(-1)
+            scores = self._score(target.unsqueeze(-2) + source.unsqueeze(-3))
+        scores = scores.masked_fill(~adjacency.unsqueeze(-1), -math.inf)
+        attention = scores.softmax(dim=-2).movedim(-1, -3)
+        return self.output(torch.einsum("...hij,...jhc->...ihc", attention, message)), attention
+
+    def joint_weight(self) -> Tensor:
+        """Everything that is linear in a node, as one matrix with rows (message, source score, target score).
+
+        Returns:
+            GAT: ``(out + 2 H, in)``; GATv2: ``(2 out, in)``, because the source's part is the message itself.
+        """
+        if self.gatv2:
+            return torch.cat([self.weight, self.target])
+        vectors = torch.stack([self.source, self.target]).unsqueeze(-2)
+        scores = vectors @ self.weight.unflatten(0, (self.heads, self.channels))
+        return torch.cat([self.weight, scores.flatten(0, -2)])
+
+    def project(self, nodes: Tensor, weight: Tensor, offset: Tensor | None = None, *, receives: bool) -> Projection:
+        """Apply ``joint_weight()``, or a product of it with an earlier linear map, to nodes ``(..., in)``."""
+        out = self.heads * self.channels
+        if not receives:  # the rows of the target's part are not needed
+            kept = out if self.gatv2 else out + self.heads
+            weight, offset = weight[:kept], None if offset is None else offset[:kept]
+        values = functional.linear(nodes, weight, offset)
+        message = values[..., :out].unflatten(-1, (self.heads, self.channels))
+        if self.gatv2:
+            target = values[..., out:].unflatten(-1, (self.heads, self.channels)) if receives else None
+            return Projection(message, message, target)
+        source = values[..., out : out + self.heads]
+        return Projection(message, source, values[..., out + self.heads :] if receives else None)
+
+    def entity_to_agent(
+        self, agents: Projection, entities: Projection, source: Tensor, target: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Stage 1 over an edge list: each agent hears itself and the obstacle nodes with an edge to it.
+
+        Args:
+            agents: projections of T packed agents.
+            entities: projections of K packed obstacle nodes.
+            source: the obstacle node of each edge, ``(E,)``.
+            target: the agent of each edge, ``(E,)``, ascending.
+
+        Returns:
+            New agents ``(T, out_features)`` and the weights of self-loops ``(T, H)`` and of edges ``(E, H)``.
+        """
+        assert agents.target is not None
+        message = entities.message.index_select(0, source)
+        source_part = message if self.gatv2 else entities.source.index_select(0, source)
+        own = self._score(agents.target + agents.source)
+        incoming = self._score(agents.target.index_select(0, target) + source_part)
+        own, incoming = edge_softmax(own, incoming, target)
+        aggregated = own.unsqueeze(-1) * agents.message
+        aggregated = aggregated.index_add(0, target, incoming.unsqueeze(-1) * message)
+        return self.output(aggregated), own, incoming
+
+    def chain(self, agents: Projection, n_agents: int) -> tuple[Tensor, Tensor]:
+        """Stage 2: each agent hears itself and its neighbours on the chain.
+
+        Args:
+            agents: projections of T packed agents, T a multiple of N.
+            n_agents: N.
+
+        Returns:
+            New agents ``(T, out_features)`` and the weights ``(3, T / N, N, H)`` of the previous agent, the agent
+            itself and the next one; zero where there is none.
+        """
+        assert agents.target is not None
+        message, source, target = (part.unflatten(0, (-1, n_agents)) for part in agents if part is not None)
+        absent = message.new_full((1,), -math.inf).expand(message.shape[0], 1, self.heads)
+        previous = torch.cat([absent, self._score(target[:, 1:] + source[:, :-1])], dim=1)
+        following = torch.cat([self._score(target[:, :-1] + source[:, 1:]), absent], dim=1)
+        weights = torch.stack([previous, self._score(target + source), following]).softmax(dim=0)
+        before, own, after = weights.unsqueeze(-1)
+        aggregated = own * message
+        aggregated[:, 1:].add_(before[:, 1:] * message[:, :-1])  # addcmul_ has no batching rule under vmap
+        aggregated[:, :-1].add_(after[:, :-1] * message[:, 1:])
+        return self.output(aggregated).flatten(0, 1), weights
+
+    def output(self, aggregated: Tensor) -> Tensor:
+        """Concatenate the heads of ``(..., H, C)`` and add the bias: ``(..., out_features)``."""
+        return aggregated.flatten(-2) + self.bias
+
+    def _score(self, pair: Tensor) -> Tensor:
+        """Scores from the sum of the target's and the source's part: ``(..., H)``."""
+        pair = functional.leaky_relu(pair, NEGATIVE_SLOPE)
+        return (pair * self.source).sum(-1) if self.gatv2 else pair
+
+
+def edge_softmax(own: Tensor, incoming: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    """Softmax over each target's self-loop and incoming edges.
+
+    Args:
+        own: scores of self-loops, ``(T, H)``.
+        incoming: scores of edges, ``(E, H)``.
+        target: row of each edge's target, ``(E,)``.
+
+    Returns:
+        Weights of self-loops ``(T, H)`` and of edges ``(E, H)``.
+    """
+    index = target.unsqueeze(-1).expand_as(incoming)
+    peak = own.detach().scatter_reduce(0, index, incoming.detach(), "amax")
+    own = (own - peak).exp()
+    incoming = (incoming - peak.index_select(0, target)).exp()
+    total = own.index_add(0, target, incoming)
+    return own / total, incoming / total.index_select(0, target)

@@ -1,0 +1,145 @@
+"""From the observation to the paper's graph and to the flat view of an MLP: pure functions, two views of one content.
+
+Shapes: ``...`` are any leading batch dimensions (time, environment), N agents, M obstacle slots. The node order is the
+paper's: the N agents first, then the M slots. Contract with the environment: an edge exists only from an active slot.
+"""
+
+from typing import NamedTuple
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from softgm_bench.envs import keys
+
+NODE_FEATURES = 22  # the paper's x_v
+CHANNELS = 15  # of which the last 7 are reserved zeros for every node type
+AGENT, OBSTACLE, PAD = 0, 1, 2  # node types
+
+
+def agent_channels(td: TensorDictBase, velocity_scale: float = 1.0) -> Tensor:
+    """The agents' features without the reserved zeros, ``(..., N, 15)``.
+
+    In order: position, velocity, previous action (tangential zero, normal, binormal), target - position,
+    tip - position. The velocity is multiplied by ``velocity_scale``; 1 is the paper.
+    """
+    position, velocity, action = td[keys.AGENT_POSITION], td[keys.AGENT_VELOCITY], td[keys.PREVIOUS_ACTION]
+    target, tip = td[keys.TARGET].unsqueeze(-2), td[keys.TIP].unsqueeze(-2)
+    tangential = action.new_zeros(()).expand(*action.shape[:-1], 1)
+    if velocity_scale != 1.0:
+        velocity = velocity * velocity_scale
+    return torch.cat([position, velocity, tangential, action, target - position, tip - position], dim=-1)
+
+
+def slot_channels(td: TensorDictBase) -> Tensor:
+    """The slots' features without the reserved zeros, ``(..., M, 15)``; an inactive slot (PAD) is exactly zero.
+
+    In order: centre, axis, (radius, length, normalised axial position), target - centre, tip - centre.
+    """
+    descriptor, active = td[keys.SLOT_DESCRIPTOR], td[keys.SLOT_ACTIVE].unsqueeze(-1)
+    target, tip = td[keys.TARGET].unsqueeze(-2), td[keys.TIP].unsqueeze(-2)
+    return torch.where(active, obstacle_channels(descriptor, target, tip), 0.0)
+
+
+def obstacle_channels(descriptor: Tensor, target: Tensor, tip: Tensor) -> Tensor:
+    """Features of obstacle nodes from descriptors ``(..., 9)`` and targets and tips that broadcast to ``(..., 3)``."""
+    centre = descriptor[..., :3]
+    return torch.cat([descriptor, target - centre, tip - centre], dim=-1)
+
+
+def agent_features(td: TensorDictBase) -> Tensor:
+    """The agent nodes' ``x_i``, ``(..., N, 22)`` (section "Graph Construction")."""
+    return pad_channels(agent_channels(td))
+
+
+def slot_features(td: TensorDictBase) -> Tensor:
+    """The slot nodes' ``x_k``, ``(..., M, 22)``; a PAD node is exactly zero (section "Graph Construction")."""
+    return pad_channels(slot_channels(td))
+
+
+def node_types(td: TensorDictBase) -> Tensor:
+    """AGENT, OBSTACLE or PAD of every node, int64 ``(..., N + M)``."""
+    active = td[keys.SLOT_ACTIVE]
+    agents = active.new_full((*active.shape[:-1], td[keys.EDGE].shape[-2]), AGENT, dtype=torch.long)
+    slots = torch.full_like(active, PAD, dtype=torch.long).masked_fill_(active, OBSTACLE)
+    return torch.cat([agents, slots], dim=-1)
+
+
+def chain_adjacency(n_agents: int, device: torch.device | None = None) -> Tensor:
+    """Neighbouring agents, both ways, without self-loops: bool ``(N, N)``."""
+    index = torch.arange(n_agents, device=device)
+    return (index.unsqueeze(0) - index.unsqueeze(1)).abs() == 1
+
+
+def full_adjacency(td: TensorDictBase) -> Tensor:
+    """The paper's A_t, bool ``(..., N + M, N + M)``: row u, column v true if a message may go from v to u.
+
+    Agents hear their neighbours on the chain and the obstacles that they sense; slots hear nobody. Self-loops belong
+    to the stages, not to A_t.
+    """
+    edge = td[keys.EDGE]
+    n_agents, n_slots = edge.shape[-2:]
+    adjacency = edge.new_zeros((*edge.shape[:-2], n_agents + n_slots, n_agents + n_slots))
+    adjacency[..., :n_agents, :n_agents] = chain_adjacency(n_agents, edge.device)
+    adjacency[..., :n_agents, n_agents:] = edge
+    return adjacency
+
+
+def flat_observation(td: TensorDictBase) -> Tensor:
+    """What an MLP reads, per agent, ``(..., N, F)`` with F = ``flat_features(M)``: the same content as the graph.
+
+    In order: the agent's own 15 channels, the 15 channels of slot 0, 1, .., M - 1, the agent's own row of M sensed
+    edges as 0 or 1. The 7 reserved zeros of each node carry nothing and are left out.
+    """
+    own, slots = agent_channels(td), slot_channels(td)
+    shared = slots.flatten(-2).unsqueeze(-2).expand(*own.shape[:-1], -1)
+    return torch.cat([own, shared, td[keys.EDGE].to(own.dtype)], dim=-1)
+
+
+def flat_features(n_slots: int) -> int:
+    """Length of one agent's flat observation."""
+    return CHANNELS + n_slots * (CHANNELS + 1)
+
+
+def pad_channels(channels: Tensor) -> Tensor:
+    """Append the paper's reserved zeros: ``(..., 15)`` to ``(..., 22)``."""
+    return torch.nn.functional.pad(channels, (0, NODE_FEATURES - CHANNELS))
+
+
+class Sensed(NamedTuple):
+    """The K obstacle nodes that some agent senses now, packed over the batch, and the E edges from them.
+
+    Attributes:
+        channels: features of the nodes, ``(K, 15)``.
+        source: the node of each edge, ``(E,)``.
+        target: the agent of each edge among all ``B N`` packed agents, ascending, ``(E,)``.
+        slot: the slot of each edge's node, ``(E,)``.
+    """
+
+    channels: Tensor
+    source: Tensor
+    target: Tensor
+    slot: Tensor
+
+
+def sense(td: TensorDictBase) -> Sensed | None:
+    """Gather what the entity -> agent edges need; None if there is no edge. Leading dimensions are packed into B."""
+    edge = td[keys.EDGE]
+    n_agents, n_slots = edge.shape[-2:]
+    position = edge.reshape(-1).nonzero().squeeze(-1)
+    if position.numel() == 0:
+        return None
+    target = position // n_slots
+    slot = position - target * n_slots
+    row = (target // n_agents) * n_slots + slot  # the slot's row among all B M slots
+
+    active = edge.new_zeros(edge.numel() // n_agents).index_fill_(0, row, True)
+    rows = active.nonzero().squeeze(-1)
+    rank = torch.empty_like(active, dtype=torch.long)  # read only where written
+    rank.index_copy_(0, rows, torch.arange(rows.numel(), device=rows.device))
+
+    environment = rows // n_slots
+    descriptor = td[keys.SLOT_DESCRIPTOR].flatten(0, -2).index_select(0, rows)
+    goal = td[keys.TARGET].reshape(-1, 3).index_select(0, environment)
+    tip = td[keys.TIP].reshape(-1, 3).index_select(0, environment)
+    return Sensed(obstacle_channels(descriptor, goal, tip), rank.index_select(0, row), target, slot)

@@ -1,0 +1,169 @@
+"""From embeddings to TorchRL actors and critics; the same heads for every encoder.
+
+Each network reads ``keys.OBSERVATION`` from the tensordict itself: an encoder and its head cost one module call.
+"""
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import (
+    InteractionType,
+    ProbabilisticTensorDictModule,
+    ProbabilisticTensorDictSequential,
+    TensorDictModuleBase,
+)
+from torch import Tensor, nn
+from torchrl.modules import TanhNormal
+
+from softgm_bench.envs import keys
+from softgm_bench.models import graph
+from softgm_bench.models.registry import Encoder, build_encoder
+
+ACTIONS = 2  # normal and binormal
+LOC = ("agents", "loc")  # (B, N, 2), before the bound
+SCALE = ("agents", "scale")  # (B, N, 2)
+STATE_VALUE = "state_value"  # (B, 1)
+
+
+@dataclass
+class ActorConfig:
+    """The policy's head f_pi. Values: ``conf/model``.
+
+    Attributes:
+        widths: hidden layers, each followed by tanh.
+        initial_sigma: standard deviation of the pre-tanh Gaussian at the start, between the bounds.
+        min_sigma: lower bound of the standard deviation.
+        max_sigma: upper bound of the standard deviation.
+        state_dependent_sigma: sigma is an output of the network instead of the paper's free parameter.
+        mean_bound: bound b of the pre-tanh mean, applied as b tanh(mu / b).
+    """
+
+    widths: list[int]
+    initial_sigma: float
+    min_sigma: float
+    max_sigma: float
+    state_dependent_sigma: bool
+    mean_bound: float
+
+
+@dataclass
+class ValueConfig:
+    """The critic's head f_V. Values: ``conf/model``.
+
+    Attributes:
+        widths: hidden layers, each followed by tanh.
+    """
+
+    widths: list[int]
+
+
+def feedforward(in_features: int, widths: Sequence[int], out_features: int, last_gain: float) -> nn.Sequential:
+    """Linear layers with tanh between them, orthogonal weights (gain sqrt 2, the last ``last_gain``), zero biases."""
+    sizes = [in_features, *widths, out_features]
+    layers: list[nn.Module] = []
+    for index, (fan_in, fan_out) in enumerate(itertools.pairwise(sizes)):
+        linear = nn.Linear(fan_in, fan_out)
+        nn.init.orthogonal_(linear.weight, last_gain if index == len(widths) else math.sqrt(2))
+        nn.init.zeros_(linear.bias)
+        layers += [linear, nn.Tanh()]
+    return nn.Sequential(*layers[:-1])
+
+
+class AgentHead(nn.Module):
+    """``f([o_i || g_i])`` for every agent with shared parameters; o_i is the agent's own node (15 channels)."""
+
+    def __init__(self, encoder: Encoder, widths: Sequence[int], out_features: int, last_gain: float) -> None:
+        """Put f (hidden layers ``widths``, last layer scaled by ``last_gain``) on an encoder, which gives g_i."""
+        super().__init__()
+        self.encoder = encoder
+        self.function = feedforward(graph.CHANNELS + self.encoder.out_features, widths, out_features, last_gain)
+
+    def forward(self, td: TensorDictBase) -> Tensor:
+        """``(..., N, out_features)``."""
+        own = graph.agent_channels(td, self.encoder.velocity_scale)
+        return self.function(torch.cat([own, self.encoder(td)], dim=-1))
+
+
+class GaussianPolicy(TensorDictModuleBase):
+    """Writes the pre-tanh mean ``LOC`` and standard deviation ``SCALE`` of every agent's action, ``(..., N, 2)``."""
+
+    in_keys: ClassVar = list(keys.OBSERVATION)
+    out_keys: ClassVar = [LOC, SCALE]
+
+    def __init__(self, encoder: Encoder, config: ActorConfig) -> None:
+        """Put the policy's head on an encoder."""
+        super().__init__()
+        outputs = 2 * ACTIONS if config.state_dependent_sigma else ACTIONS
+        self.head = AgentHead(encoder, config.widths, outputs, last_gain=0.01)
+        if not 0.0 < config.min_sigma < config.initial_sigma < config.max_sigma:
+            raise ValueError(
+                f"initial_sigma={config.initial_sigma} must lie between min_sigma={config.min_sigma} and "
+                f"max_sigma={config.max_sigma}, and all must be positive"
+            )
+        self.low, self.range = math.log(config.min_sigma), math.log(config.max_sigma / config.min_sigma)
+        fraction = torch.tensor((math.log(config.initial_sigma) - self.low) / self.range)
+        self.sigma = nn.Parameter(fraction.logit().repeat(ACTIONS))
+
+    def forward(self, td: TensorDictBase) -> TensorDictBase:
+        """Write ``LOC`` and ``SCALE``.
+
+        log sigma moves between its bounds on a logistic curve, along the parameter or, if it depends on the state,
+        along the parameter plus the network's output. (A clamp would have no gradient beyond a bound and never return.)
+        """
+        output = self.head(td)
+        loc, sigma = output[..., :ACTIONS], self.sigma
+        if output.shape[-1] > ACTIONS:
+            sigma = sigma + output[..., ACTIONS:]
+        td.set(LOC, loc)
+        td.set(SCALE, (self.low + self.range * sigma.sigmoid()).exp().expand_as(loc))
+        return td
+
+
+class TeamValue(TensorDictModuleBase):
+    """Writes V(s) = f_V(mean over agents of g_i), ``(..., 1)`` (section "Distributed Control Policy")."""
+
+    in_keys: ClassVar = list(keys.OBSERVATION)
+    out_keys: ClassVar = [STATE_VALUE]
+
+    def __init__(self, encoder: Encoder, config: ValueConfig) -> None:
+        """Put the critic's head on an encoder."""
+        super().__init__()
+        self.encoder = encoder
+        self.function = feedforward(self.encoder.out_features, config.widths, 1, last_gain=1.0)
+
+    def forward(self, td: TensorDictBase) -> TensorDictBase:
+        """Write ``STATE_VALUE``."""
+        return td.set(STATE_VALUE, self.function(self.encoder(td).mean(dim=-2)))
+
+
+def build_actor(
+    encoder_config: Any, n_agents: int, n_slots: int, config: ActorConfig
+) -> ProbabilisticTensorDictSequential:
+    """The squashed Gaussian actor: reads ``keys.OBSERVATION``, writes ``keys.ACTION`` and ``keys.LOG_PROB`` (B, N).
+
+    It samples unless ``set_exploration_type`` says otherwise. tensordict's module is used and not TorchRL's
+    ``ProbabilisticActor``: the latter (0.14.1) stores the log-probability of the pre-tanh sample, which differs from
+    that of the stored float32 action by 2 % at |z| = 6 and without limit beyond, so that PPO's ratio of an unchanged
+    policy would not be one. Losses that need the exact pathwise sample (SAC) take it from ``get_dist``.
+    """
+    policy = GaussianPolicy(build_encoder(encoder_config, n_agents, n_slots), config)
+    sample = ProbabilisticTensorDictModule(
+        in_keys={"loc": LOC, "scale": SCALE},
+        out_keys=[keys.ACTION],
+        distribution_class=TanhNormal,
+        distribution_kwargs={"tanh_loc": True, "upscale": config.mean_bound, "event_dims": 1},
+        return_log_prob=True,
+        log_prob_key=keys.LOG_PROB,
+        default_interaction_type=InteractionType.RANDOM,
+    )
+    return ProbabilisticTensorDictSequential(policy, sample)
+
+
+def build_value(encoder_config: Any, n_agents: int, n_slots: int, config: ValueConfig) -> TeamValue:
+    """The paper's critic with a graph network of its own: reads ``keys.OBSERVATION``, writes ``STATE_VALUE`` (B, 1)."""
+    return TeamValue(build_encoder(encoder_config, n_agents, n_slots), config)

@@ -1,0 +1,181 @@
+"""SoftGM's encoder: two stages of graph attention (paper, section "Attention-based Message Passing").
+
+Cheap by construction. Only obstacle slots with an edge to some agent are computed: slots hear nobody, so one without an
+edge cannot influence any agent. Nothing between ``W_in`` and the first attention layer is nonlinear, so their matrices
+are multiplied first and ``h^(0)`` is never formed (unless a residual connection needs it). ``forward_dense`` is the
+paper's text, all nodes and masked, with the same parameters; the two agree to rounding.
+
+Where the paper is silent: ELU after every layer but the very last, a bias in every layer, and heads concatenated in all
+of them (Velickovic et al. 2018 average them in a classifier's last layer).
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import cast
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torch.nn import functional
+
+from softgm_bench.envs import keys
+from softgm_bench.models import graph
+from softgm_bench.models.attention import chain_attention, entity_attention, stack_layers
+from softgm_bench.models.gat import GraphAttention
+from softgm_bench.models.registry import Encoder, register_model
+
+
+@dataclass
+class SoftGMConfig:
+    """Architecture of SoftGM. Values: ``conf/model/softgm.yaml``.
+
+    Attributes:
+        hidden: length of a node's embedding, over all heads (paper: 128).
+        heads: attention heads; divides ``hidden`` (paper: 4).
+        layers: L, attention layers in each stage (paper: 2).
+        type_embedding: length of the learnt embedding of a node's type (paper: 8).
+        stage1: entity -> agent messages; false is the paper's ablation "without stage 1".
+        stage2: agent <-> agent messages; false is the paper's ablation "without stage 2".
+        gatv2: GATv2 scores instead of the paper's GAT scores.
+        residual: add a layer's input to its output (paper: no).
+        velocity_scale: factor of the agents' velocity channels at the input (paper: 1).
+    """
+
+    hidden: int
+    heads: int
+    layers: int
+    type_embedding: int
+    stage1: bool
+    stage2: bool
+    gatv2: bool
+    residual: bool
+    velocity_scale: float
+
+
+Affine = tuple[Tensor, Tensor | None]  # weight and offset of a linear map that is still to be applied
+Record = list[Tensor] | None  # where to leave the attention of each layer
+
+
+@register_model("softgm", SoftGMConfig)
+class SoftGMEncoder(Encoder):
+    """From the observation to one embedding g_i per agent."""
+
+    def __init__(self, config: SoftGMConfig, n_agents: int, n_slots: int) -> None:
+        """Draw the parameters; none depends on N or M, which ``forward`` takes from the observation."""
+        super().__init__(config.hidden, config.velocity_scale)
+        self.config = config
+        self.types = nn.Embedding(3, config.type_embedding)  # PAD's row never trains: a PAD node has no edge
+        self.input = nn.Linear(graph.NODE_FEATURES + config.type_embedding, config.hidden, bias=False)
+        nn.init.xavier_uniform_(self.input.weight)
+
+        def stage(used: bool) -> nn.ModuleList:
+            depth = config.layers if used else 0
+            sizes = (config.hidden, config.hidden, config.heads, config.gatv2)
+            return nn.ModuleList(GraphAttention(*sizes) for _ in range(depth))
+
+        self.stage1, self.stage2 = stage(config.stage1), stage(config.stage2)
+
+    def forward(self, td: TensorDictBase) -> Tensor:
+        """Embeddings ``(..., N, hidden)`` from the entries ``keys.OBSERVATION``."""
+        return self._embed(td, None, None)
+
+    def forward_with_attention(self, td: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Embeddings as ``forward``, and the attention weights of every layer.
+
+        Returns:
+            ``stage1``: ``(..., L, H, N, N + M)``, of every node (agents, then slots) for every agent; ``stage2``:
+            ``(..., L, H, N, N)``. Rows sum to one. A stage that is switched off is absent.
+        """
+        stage1: list[Tensor] = []
+        stage2: list[Tensor] = []
+        embeddings = self._embed(td, stage1, stage2)
+        return embeddings, stack_layers({"stage1": stage1, "stage2": stage2}, embeddings.shape[:-2])
+
+    def forward_dense(self, td: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """The paper's formulas over all N + M nodes, masked: the reference for ``forward_with_attention``."""
+        n_agents, n_slots = td[keys.EDGE].shape[-2:]
+        channels = torch.cat([graph.agent_channels(td, self.velocity_scale), graph.slot_channels(td)], dim=-2)
+        nodes = self.input(torch.cat([graph.pad_channels(channels), self.types(graph.node_types(td))], dim=-1))
+        lead = nodes.shape[:-2]
+
+        adjacency = graph.full_adjacency(td)
+        identity = torch.eye(n_agents + n_slots, dtype=torch.bool, device=nodes.device)
+        is_agent = torch.arange(n_agents + n_slots, device=nodes.device) < n_agents
+        record: dict[str, list[Tensor]] = {"stage1": [], "stage2": []}
+        plan = [("stage1", ~is_agent, layer) for layer in _layers(self.stage1)]
+        plan += [("stage2", is_agent, layer) for layer in _layers(self.stage2)]
+        for depth, (stage, sources, layer) in enumerate(plan, start=1):
+            out, attention = layer(nodes, (adjacency & is_agent.unsqueeze(-1) & sources) | identity)
+            nodes = self._between(out, nodes, last=depth == len(plan))
+            columns = n_agents + n_slots if stage == "stage1" else n_agents
+            record[stage].append(attention[..., :n_agents, :columns].reshape(-1, layer.heads, n_agents, columns))
+        return nodes[..., :n_agents, :], stack_layers(record, lead)
+
+    def _embed(self, td: TensorDictBase, stage1: Record, stage2: Record) -> Tensor:
+        channels = graph.agent_channels(td, self.velocity_scale)
+        shape = td[keys.EDGE].shape[-2:]
+        agents, pending = self._enter(channels.flatten(0, -2), graph.AGENT)  # packed: (B N, 15 or hidden)
+        if len(self.stage1):
+            agents = self._entity_stage(td, agents, pending, stage1)
+            pending = None
+        if len(self.stage2):
+            agents = self._agent_stage(agents, pending, shape[0], stage2)
+        return agents.unflatten(0, channels.shape[:-1])
+
+    def _entity_stage(self, td: TensorDictBase, agents: Tensor, pending: Affine | None, record: Record) -> Tensor:
+        """Stage 1: ``(B N, hidden)`` after L layers of entity -> agent messages."""
+        sensed = graph.sense(td)
+        if sensed is not None:
+            entities, entity_pending = self._enter(sensed.channels, graph.OBSTACLE)
+        for depth, layer in enumerate(_layers(self.stage1), start=1):
+            last = depth == len(self.stage1)
+            weight = layer.joint_weight()
+            own = layer.project(agents, *_after(weight, pending), receives=True)
+            own_weights, edge_weights = None, None
+            if sensed is None:  # every agent hears only itself
+                out = layer.output(own.message)
+            else:
+                other = layer.project(entities, *_after(weight, entity_pending), receives=False)
+                out, own_weights, edge_weights = layer.entity_to_agent(own, other, sensed.source, sensed.target)
+                if not last:  # an obstacle node hears only itself; nobody reads what the last layer makes of it
+                    entities, entity_pending = self._between(layer.output(other.message), entities, last=False), None
+            agents, pending = self._between(out, agents, last=last and not len(self.stage2)), None
+            if record is not None:
+                own_weights = out.new_ones(len(out), layer.heads) if own_weights is None else own_weights
+                record.append(entity_attention(own_weights, edge_weights, sensed, td[keys.EDGE].shape[-2:]))
+        return agents
+
+    def _agent_stage(self, agents: Tensor, pending: Affine | None, n_agents: int, record: Record) -> Tensor:
+        """Stage 2: ``(B N, hidden)`` after L layers of agent <-> agent messages."""
+        for depth, layer in enumerate(_layers(self.stage2), start=1):
+            own = layer.project(agents, *_after(layer.joint_weight(), pending), receives=True)
+            out, weights = layer.chain(own, n_agents)
+            agents, pending = self._between(out, agents, last=depth == len(self.stage2)), None
+            if record is not None:
+                record.append(chain_attention(weights))
+        return agents
+
+    def _enter(self, channels: Tensor, node_type: int) -> tuple[Tensor, Affine | None]:
+        """``h^(0)`` of nodes of one type; or, if a layer follows that can absorb ``W_in``, their channels and W_in."""
+        weight = self.input.weight
+        offset = weight[:, graph.NODE_FEATURES :] @ self.types.weight[node_type]
+        pending = (weight[:, : graph.CHANNELS], offset)
+        if self.config.residual or not (len(self.stage1) or len(self.stage2)):
+            return functional.linear(channels, *pending), None
+        return channels, pending
+
+    def _between(self, out: Tensor, before: Tensor, *, last: bool) -> Tensor:
+        if self.config.residual:
+            out = out + before
+        return out if last else functional.elu(out)
+
+
+def _layers(stage: nn.ModuleList) -> Iterable[GraphAttention]:
+    return cast(Iterable[GraphAttention], stage)
+
+
+def _after(weight: Tensor, pending: Affine | None) -> Affine:
+    """``weight`` applied after a pending linear map, as one linear map."""
+    if pending is None:
+        return weight, None
+    return weight @ pending[0], None if pending[1] is None else weight @ pending[1]

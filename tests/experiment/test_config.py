@@ -1,0 +1,133 @@
+import dataclasses
+
+import pytest
+import yaml
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from softgm_bench.config import UserError, compose, compose_untyped, config_directory, plain, typed
+from softgm_bench.envs.tasks import TASK_CONFIGS
+from softgm_bench.experiment.explain import USER_ERRORS, explain
+from softgm_bench.rod.parameters import RodParameters
+
+
+def refusal(*overrides):
+    """The line that these overrides are answered with."""
+    with pytest.raises(USER_ERRORS) as caught:
+        compose(list(overrides))
+    line = explain(caught.value, list(overrides))
+    assert "\n" not in line
+    return line
+
+
+@pytest.mark.parametrize("experiment", ["default", "quick", "smoke"])
+@pytest.mark.parametrize("task", TASK_CONFIGS)
+def test_every_combination_of_files_is_valid(task, experiment):
+    config = compose([f"task={task}", f"experiment={experiment}", "seed=3"])
+
+    assert type(config.task) is TASK_CONFIGS[task]
+    assert config.run_dir == f"outputs/{task}/softgm/seed3"
+
+
+def test_the_arm_is_its_dataclass_unless_told_otherwise():
+    assert compose([]).rod == RodParameters()
+    assert compose(["rod.gravity=[0,0,-9.81]"]).rod == RodParameters(gravity=(0.0, 0.0, -9.81))
+    hash(compose([]).rod)
+
+
+def test_a_model_can_be_chosen_against_the_algorithms_own():
+    assert type(compose([]).model).__name__ == "SoftGMConfig"
+    assert type(compose(["model=mlp"]).model).__name__ == "MLPConfig"
+
+
+def test_plain_values_give_the_same_configuration_back():
+    config = compose(["task=wall", "model=mlp"])
+
+    assert typed(OmegaConf.create(yaml.safe_load(yaml.safe_dump(plain_lists(plain(config)))))) == config
+
+
+def plain_lists(value):
+    if isinstance(value, dict):
+        return {key: plain_lists(item) for key, item in value.items()}
+    return [plain_lists(item) for item in value] if isinstance(value, tuple) else value
+
+
+def test_dataclasses_carry_no_values_of_their_own_but_the_arms():
+    config = compose([])
+    parts = (config, config.experiment, config.experiment.evaluation, config.task, config.algo, config.model)
+    for part in parts:
+        fields = dataclasses.fields(part)
+        assert all(field.default is field.default_factory is dataclasses.MISSING for field in fields), type(part)
+
+
+def test_keys_that_nobody_reads_are_refused_wherever_they_are_written():
+    assert refusal("seeed=1") == "seeed: no such key; did you mean seed?"
+    assert refusal("+task.horizn=1") == "task.horizn: no such key; did you mean task.horizon?"
+    assert refusal("num_envs=1") == "num_envs: no such key; did you mean experiment.num_envs?"
+    assert refusal("task=wall", "task.opening_sid=1") == (
+        "task.opening_sid: no such key; did you mean task.opening_side?"
+    )
+    assert refusal("algo.xyzzyx=1") == "algo.xyzzyx: no such key; --cfg job lists every key"
+
+
+def test_values_of_the_wrong_type_are_refused():
+    for override in ("seed=1.5", "seed=true", "overwrite=maybe", "experiment.evaluation.episodes=[1]", "rod.dt=fast"):
+        assert refusal(override).startswith(override.partition("=")[0] + ": ")
+
+
+def test_unknown_choices_list_the_known_ones():
+    tasks = "basic, structured, wall, wall_fixed, wall_narrow"
+    assert refusal("task=wal") == f"task=wal: no such task; choose one of {tasks}"
+    assert refusal("experiment=fast") == "experiment=fast: no such experiment; choose one of default, quick, smoke"
+    assert refusal("model=cnn") == "model=cnn: no such model; choose one of mlp, softgm"
+    assert refusal("task=common").startswith("task.name=None: no such task; choose one of basic, ")
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        "seed=-1",
+        "threads=0",
+        "threads=100000",
+        "device=gpu",
+        "device=cuda",
+        "backend=jax",
+        "run_dir=''",
+        "experiment.total_frames=0",
+        "experiment.num_envs=-2",
+        "experiment.steps_per_batch=0",
+        "experiment.train_horizon=0",
+        "experiment.evaluation.interval=0",
+        "experiment.evaluation.episodes=0",
+        "experiment.evaluation.final_episodes=0",
+        "experiment.evaluation.horizon=0",
+        "experiment.checkpoint.interval=0",
+        "experiment.checkpoint.keep=0",
+        "rod.n_elements=1",
+    ],
+)
+def test_values_without_sense_are_refused_by_name(override):
+    key, _, value = override.partition("=")
+
+    with pytest.raises(UserError) as caught:
+        compose([override])
+
+    assert str(caught.value).startswith(key)
+    assert value.strip("'") in str(caught.value)
+
+
+def test_unreadable_and_dangling_overrides_are_one_line():
+    assert refusal("seed").endswith("settings are written key=value")
+    assert refusal("run_dir=${nowhere}").startswith("run_dir: ")
+
+
+def test_the_configuration_directory_is_the_repositorys():
+    assert (config_directory() / "config.yaml").is_file()
+    assert isinstance(compose_untyped([]).seed, int)
+
+
+def test_errors_of_this_program_are_not_taken_for_the_users():
+    assert not issubclass(KeyError, USER_ERRORS)
+    assert not issubclass(ValueError, USER_ERRORS)
+    assert {HydraException, OmegaConfBaseException, OSError, UserError} == set(USER_ERRORS)

@@ -1,0 +1,103 @@
+import csv
+import json
+
+import numba
+import pytest
+import torch
+
+from softgm_bench.config import UserError, compose
+from softgm_bench.experiment import checkpoint
+from softgm_bench.experiment.loop import derive_seeds, set_threads, train
+
+TINY = (
+    "experiment=smoke",
+    "threads=1",
+    "experiment.total_frames=48",
+    "experiment.num_envs=4",
+    "experiment.steps_per_batch=4",
+    "experiment.train_horizon=3",
+    "experiment.evaluation.interval=16",
+    "experiment.evaluation.horizon=2",
+    "experiment.evaluation.final_episodes=5",
+    "rod.n_elements=20",
+    "algo.epochs=2",
+    "algo.minibatch_size=8",
+)
+TIMINGS = ("wall_time", "frames_per_second")
+
+
+@pytest.fixture(autouse=True)
+def _threads_as_before():
+    before = torch.get_num_threads(), numba.get_num_threads()
+    yield
+    torch.set_num_threads(before[0])
+    numba.set_num_threads(before[1])
+
+
+def trained(folder, *overrides):
+    train(compose([*TINY, f"run_dir={folder}", *overrides]))
+    with (folder / "metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    return [{name: value for name, value in row.items() if name not in TIMINGS} for row in rows]
+
+
+def test_metrics_repeat_with_the_seed_however_often_training_is_looked_at(tmp_path):
+    first = trained(tmp_path / "first", "task=wall")
+    again = trained(tmp_path / "again", "task=wall", "experiment.evaluation.interval=1_000_000")
+    sampled = trained(tmp_path / "sampled", "task=wall", "experiment.evaluation.deterministic=false")
+    other = trained(tmp_path / "other", "task=wall", "seed=1")
+
+    assert len(first) == 3
+    assert first == again == sampled
+    assert all(one["episode_return"] != another["episode_return"] for one, another in zip(first, other, strict=True))
+
+
+def test_a_finished_run_holds_what_its_settings_promise(tmp_path):
+    summary = train(compose([*TINY, f"run_dir={tmp_path}", "task=structured", "experiment.total_frames=33"]))
+
+    assert summary == json.loads((tmp_path / "summary.json").read_text())
+    assert (summary["task"], summary["algo"], summary["seed"]) == ("structured", "softgm", 0)
+    assert summary["frames"] == 48  # whole iterations of 4 x 4
+    assert summary["threads"] == 1
+    assert summary["final_evaluation"]["episodes"] == 5
+    assert summary["final_evaluation"]["episode_length"] == {"mean": 2.0, "std": 0.0}
+    evaluations = [json.loads(line) for line in (tmp_path / "evaluations.jsonl").read_text().splitlines()]
+    assert [(line["frames"], line["episodes"]) for line in evaluations] == [(16, 4), (32, 4), (48, 4)]
+    # horizon 3: of 4 steps a batch, the third ends an episode everywhere, then the second, then the first and the last
+    with (tmp_path / "metrics.csv").open() as file:
+        assert [row["episodes"] for row in csv.DictReader(file)] == ["4", "4", "8"]
+    with (tmp_path / "episodes.csv").open() as file:
+        assert [row["length"] for row in csv.DictReader(file)] == ["2"] * 5
+
+
+def test_a_checkpoint_holds_what_going_on_needs(tmp_path):
+    train(compose([*TINY, f"run_dir={tmp_path}", "task=wall"]))
+
+    state = checkpoint.load(checkpoint.latest(tmp_path / "checkpoints"))
+
+    assert state["frames"] == 48
+    assert state["counters"]["iteration"] == 3
+    assert state["config"]["model"]["name"] == "softgm"
+    assert state["environment"]["simulation"]["rod"]["position"].shape[0] == 4
+    assert state["environment"]["simulation"]["rod"]["position"].dtype == torch.float64
+    assert {"loss", "actor_optimizer", "critic_optimizer"} <= state["algorithm"].keys()
+
+
+def test_a_full_disk_is_one_line_that_names_the_folder(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(checkpoint, "save", full)
+    with pytest.raises(UserError, match=r"^\S+/run: No space left on device; [^\n]*$"):
+        train(compose([*TINY, f"run_dir={tmp_path}/run"]))
+
+
+def test_derived_seeds_share_nothing_and_repeat():
+    seeds = [derive_seeds(seed) for seed in range(50)]
+
+    assert len({word for four in seeds for word in four}) == 200
+    assert derive_seeds(7) == seeds[7]
+
+
+def test_threads_are_set_everywhere():
+    assert set_threads(1) == torch.get_num_threads() == numba.get_num_threads() == 1

@@ -1,0 +1,76 @@
+"""Random observations and small configurations that the tests of this folder share."""
+
+import torch
+from hypothesis import strategies
+from tensordict import TensorDict
+
+from softgm_bench.envs import keys
+from softgm_bench.models import ActorConfig, SoftGMConfig, ValueConfig
+
+SEEDS = strategies.integers(0, 2**31)
+SIZES = strategies.tuples(strategies.integers(1, 5), strategies.integers(0, 6))  # N, M
+LEADS = strategies.sampled_from([(), (1,), (4,), (2, 3)])
+
+
+def observation(lead=(4,), n_agents=4, n_slots=6, seed=0, sensed=0.4, discovered=0.7, dtype=torch.float32):
+    """Every entry random; each active slot has an edge to each agent with probability ``sensed``."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape):
+        return torch.randn(*lead, *shape, generator=generator, dtype=dtype)
+
+    active = torch.rand(*lead, n_slots, generator=generator) < discovered
+    edge = (torch.rand(*lead, n_agents, n_slots, generator=generator) < sensed) & active.unsqueeze(-2)
+    entries = {
+        keys.AGENT_POSITION: normal(n_agents, 3),
+        keys.AGENT_VELOCITY: normal(n_agents, 3),
+        keys.PREVIOUS_ACTION: normal(n_agents, 2).tanh(),
+        keys.EDGE: edge,
+        keys.SLOT_DESCRIPTOR: normal(n_slots, 9) * active.unsqueeze(-1),
+        keys.SLOT_ACTIVE: active,
+        keys.TIP: normal(3),
+        keys.TARGET: normal(3),
+    }
+    td = TensorDict({}, batch_size=lead)
+    for key, value in entries.items():
+        td.set(key, value)
+    return td
+
+
+def softgm_config(**changes):
+    values = {
+        "hidden": 8,
+        "heads": 2,
+        "layers": 2,
+        "type_embedding": 3,
+        "stage1": True,
+        "stage2": True,
+        "gatv2": False,
+        "residual": False,
+        "velocity_scale": 1.0,
+    }
+    return SoftGMConfig(**(values | changes))
+
+
+def actor_config(**changes):
+    values = {
+        "widths": [8],
+        "initial_sigma": 0.5,
+        "min_sigma": 0.05,
+        "max_sigma": 2.0,
+        "state_dependent_sigma": False,
+        "mean_bound": 3.0,
+    }
+    return ActorConfig(**(values | changes))
+
+
+def value_config():
+    return ValueConfig(widths=[8])
+
+
+def randomise(module):
+    """Draw every parameter, biases and the actor's small last layer included, so that no term is hidden by a zero."""
+    with torch.no_grad():
+        for parameter in module.parameters():
+            parameter.normal_(std=0.5)
+    return module

@@ -1,0 +1,119 @@
+import pytest
+import torch
+from observations import actor_config, observation, randomise, softgm_config, value_config
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from softgm_bench.envs import keys
+from softgm_bench.models import MLPConfig, build_actor, build_value
+from softgm_bench.models.heads import LOC, SCALE, STATE_VALUE
+
+ENCODERS = pytest.mark.parametrize(
+    "encoder", [softgm_config(), MLPConfig(hidden=8, layers=2, velocity_scale=1.0)], ids=["softgm", "mlp"]
+)
+
+
+def actor(encoder=None, seed=0, **changes):
+    torch.manual_seed(seed)
+    return build_actor(encoder or softgm_config(), 4, 6, actor_config(**changes))
+
+
+@ENCODERS
+@pytest.mark.parametrize("lead", [(5,), (2, 3)])
+def test_shapes(encoder, lead):
+    td = actor(encoder)(observation(lead))
+    assert td[keys.ACTION].shape == (*lead, 4, 2)
+    assert td[keys.LOG_PROB].shape == (*lead, 4)
+    assert td[LOC].shape == td[SCALE].shape == (*lead, 4, 2)
+    assert (td[keys.ACTION].abs() <= 1).all()
+    value = build_value(encoder, 4, 6, value_config())
+    assert value(td)[STATE_VALUE].shape == (*lead, 1)
+
+
+@ENCODERS
+@pytest.mark.parametrize("state_dependent_sigma", [False, True])
+def test_the_first_policy_is_centred_and_has_the_initial_sigma(encoder, state_dependent_sigma):
+    td = actor(encoder, initial_sigma=0.7, state_dependent_sigma=state_dependent_sigma)(observation((50,)))
+    assert td[LOC].abs().max() < 0.1
+    torch.testing.assert_close(td[SCALE], torch.full_like(td[SCALE], 0.7), rtol=0.05, atol=0.0)
+
+
+@pytest.mark.parametrize("mean", [0.0, 3.0, 10.0, -50.0])
+@pytest.mark.parametrize("sigma", [0.1, 0.5, 1.9])
+def test_the_ratio_of_an_unchanged_policy_is_one(mean, sigma):
+    policy = actor(initial_sigma=sigma)
+    with torch.no_grad():
+        policy.module[0].head.function[-1].bias.fill_(mean)
+    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+        data = torch.cat([policy(observation((64,), seed=seed)) for seed in range(8)])
+    data = data[torch.randperm(len(data))]  # minibatches are other batches than the rollout's
+    stored = data[keys.LOG_PROB].clone()
+    ratio = (policy.get_dist(data).log_prob(data[keys.ACTION]) - stored).exp()
+    assert (ratio - 1).abs().max() < 1e-5
+
+
+@pytest.mark.parametrize("mean", [0.0, 10.0, -50.0])
+@pytest.mark.parametrize("state_dependent_sigma", [False, True])
+def test_gradients_are_finite(mean, state_dependent_sigma):
+    policy = actor(state_dependent_sigma=state_dependent_sigma)
+    with torch.no_grad():
+        policy.module[0].head.function[-1].bias[:2].fill_(mean)
+        data = policy(observation((64,)))
+    dist = policy.get_dist(data)
+    _, pathwise = dist.rsample_and_log_prob()
+    (dist.log_prob(data[keys.ACTION]).sum() + pathwise.sum()).backward()
+    for name, parameter in policy.named_parameters():
+        assert parameter.grad is not None, name
+        assert parameter.grad.isfinite().all(), name
+
+
+def test_it_is_deterministic_only_when_told_so():
+    policy, td = actor(), observation((5,))
+
+    def act(exploration):
+        with set_exploration_type(exploration):
+            return policy(td.clone())[keys.ACTION]
+
+    assert torch.equal(act(ExplorationType.DETERMINISTIC), act(ExplorationType.DETERMINISTIC))
+    assert not torch.equal(act(ExplorationType.RANDOM), act(ExplorationType.RANDOM))
+    assert not torch.equal(policy(td.clone())[keys.ACTION], policy(td.clone())[keys.ACTION])
+    loc = policy(td)[LOC]
+    torch.testing.assert_close(act(ExplorationType.DETERMINISTIC), (3 * (loc / 3).tanh()).tanh())
+
+
+@pytest.mark.parametrize("extreme", [-30.0, -4.0, 4.0, 30.0])
+def test_sigma_stays_between_its_bounds_and_can_return(extreme):
+    policy = actor()
+    with torch.no_grad():
+        policy.module[0].sigma.fill_(extreme)
+    scale = policy(observation((2,)))[SCALE]
+    assert scale.min() >= 0.05 * (1 - 1e-6)
+    assert scale.max() <= 2.0 * (1 + 1e-6)
+    scale.sum().backward()
+    if abs(extreme) < 10:
+        assert (policy.module[0].sigma.grad.abs() > 1e-4).all()
+
+
+def test_an_initial_sigma_outside_its_bounds_is_refused():
+    with pytest.raises(ValueError, match="initial_sigma"):
+        actor(initial_sigma=3.0)
+
+
+def test_a_slot_without_an_edge_changes_no_bit_of_any_action():
+    policy, td = randomise(actor()), observation((9,))
+    changed = td.clone()
+    unsensed = ~td[keys.EDGE].any(dim=-2, keepdim=True).mT
+    changed[keys.SLOT_DESCRIPTOR] = torch.where(unsensed, 5.0, td[keys.SLOT_DESCRIPTOR])
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        assert torch.equal(policy(td)[keys.ACTION], policy(changed)[keys.ACTION])
+
+
+def test_the_value_pools_the_agents_mean():
+    td = observation((5,))
+    value = build_value(softgm_config(), 4, 6, value_config())
+    expected = value.function(value.encoder(td).mean(dim=-2))
+    assert torch.equal(value(td)[STATE_VALUE], expected)
+
+
+def test_actor_and_critic_share_no_parameter():
+    policy, value = actor(), build_value(softgm_config(), 4, 6, value_config())
+    assert not {id(p) for p in policy.parameters()} & {id(p) for p in value.parameters()}

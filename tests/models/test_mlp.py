@@ -1,0 +1,26 @@
+import torch
+from hypothesis import given, settings
+from observations import LEADS, SEEDS, SIZES, observation, randomise
+
+from softgm_bench.envs import keys
+from softgm_bench.models import MLPConfig, MLPEncoder, graph
+
+
+@settings(max_examples=30, deadline=None)
+@given(LEADS, SIZES, SEEDS)
+def test_it_is_an_mlp_on_the_flat_observation(lead, sizes, seed):
+    torch.manual_seed(seed)
+    model = randomise(MLPEncoder(MLPConfig(hidden=7, layers=2, velocity_scale=1.0), *sizes)).double()
+    td = observation(lead, *sizes, seed=seed, dtype=torch.float64)
+    plain = torch.nn.Sequential(model.first, torch.nn.Tanh(), model.rest[0], torch.nn.Tanh())
+    out = model(td)
+    assert out.shape == (*lead, sizes[0], 7)
+    torch.testing.assert_close(out, plain(graph.flat_observation(td)), rtol=1e-12, atol=1e-12)
+
+
+def test_it_knows_undiscovered_slots_by_nothing():
+    model = MLPEncoder(MLPConfig(hidden=7, layers=1, velocity_scale=0.5), 4, 6)
+    td = observation((5,), 4, 6)
+    changed = td.clone()
+    changed[keys.SLOT_DESCRIPTOR] = torch.where(td[keys.SLOT_ACTIVE].unsqueeze(-1), td[keys.SLOT_DESCRIPTOR], 9.0)
+    assert torch.equal(model(td), model(changed))

@@ -1,0 +1,21 @@
+import pytest
+from observations import softgm_config
+
+from softgm_bench.models import MLPConfig, MLPEncoder, SoftGMConfig, SoftGMEncoder, build_encoder, model_configs
+from softgm_bench.models.registry import register_model
+
+
+def test_the_configuration_chooses_the_encoder():
+    assert isinstance(build_encoder(softgm_config(), 4, 6), SoftGMEncoder)
+    assert isinstance(build_encoder(MLPConfig(hidden=8, layers=1, velocity_scale=1.0), 4, 6), MLPEncoder)
+    assert model_configs() == {"softgm": SoftGMConfig, "mlp": MLPConfig}
+
+
+def test_a_configuration_of_no_model_is_refused():
+    with pytest.raises(ValueError, match="no model's configuration"):
+        build_encoder({"hidden": 8}, 4, 6)
+
+
+def test_a_name_is_registered_once():
+    with pytest.raises(ValueError, match="registered already"):
+        register_model("softgm", dict)(MLPEncoder)

@@ -1,0 +1,173 @@
+import itertools
+
+import pytest
+import torch
+from hypothesis import given, settings
+from observations import LEADS, SEEDS, SIZES, observation, randomise, softgm_config
+
+from softgm_bench.envs import keys
+from softgm_bench.models import SoftGMEncoder
+
+SWITCHES = [
+    {"stage1": stage1, "stage2": stage2, "gatv2": gatv2, "residual": residual}
+    for stage1, stage2, gatv2, residual in itertools.product([True, False], repeat=4)
+]
+
+
+def encoder(dtype=torch.float32, seed=0, **changes):
+    torch.manual_seed(seed)
+    return randomise(SoftGMEncoder(softgm_config(**changes), n_agents=4, n_slots=6)).to(dtype)
+
+
+@pytest.mark.parametrize("switches", SWITCHES, ids=str)
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-6), (torch.float64, 1e-12)])
+def test_sparse_equals_dense(switches, dtype, tolerance):
+    torch.manual_seed(0)
+    model = SoftGMEncoder(softgm_config(velocity_scale=0.5, hidden=128, heads=4, **switches), 4, 6).to(dtype)
+    td = observation((2, 5), 4, 6, dtype=dtype)
+    sparse, weights = model.forward_with_attention(td)
+    dense, expected = model.forward_dense(td)
+    torch.testing.assert_close(sparse, dense, rtol=tolerance, atol=tolerance)
+    assert weights.keys() == expected.keys()
+    for stage in expected:
+        torch.testing.assert_close(weights[stage], expected[stage], rtol=tolerance, atol=tolerance)
+    assert torch.equal(model(td), sparse)
+
+
+@settings(max_examples=30, deadline=None)
+@given(LEADS, SIZES, SEEDS)
+def test_sparse_equals_dense_for_any_sizes(lead, sizes, seed):
+    n_agents, n_slots = sizes
+    model = encoder(torch.float64, seed)
+    td = observation(lead, *sizes, seed=seed, dtype=torch.float64)
+    sparse, weights = model.forward_with_attention(td)
+    dense, expected = model.forward_dense(td)
+    assert sparse.shape == (*lead, n_agents, 8)
+    assert weights["stage1"].shape == (*lead, 2, 2, n_agents, n_agents + n_slots)
+    assert weights["stage2"].shape == (*lead, 2, 2, n_agents, n_agents)
+    torch.testing.assert_close(sparse, dense, rtol=1e-12, atol=1e-12)
+    for stage in expected:
+        torch.testing.assert_close(weights[stage], expected[stage], rtol=1e-12, atol=1e-12)
+        torch.testing.assert_close(weights[stage].sum(-1), torch.ones_like(weights[stage][..., 0]))
+
+
+@pytest.mark.parametrize("gatv2", [False, True])
+def test_gradients_equal_those_of_the_dense_form(gatv2):
+    model = encoder(torch.float64, gatv2=gatv2)
+    td = observation((7,), 4, 6, dtype=torch.float64)
+    parameters = list(model.parameters())
+    sparse = torch.autograd.grad(model(td).square().sum(), parameters)
+    dense = torch.autograd.grad(model.forward_dense(td)[0].square().sum(), parameters)
+    for one, other in zip(sparse, dense, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-10, atol=1e-10)
+
+
+@settings(max_examples=30, deadline=None)
+@given(SIZES, SEEDS)
+def test_slots_without_an_edge_change_no_bit(sizes, seed):
+    model = encoder(seed=seed)
+    td = observation((5,), *sizes, seed=seed)
+    other = observation((5,), *sizes, seed=seed + 1)
+    unsensed = ~td[keys.EDGE].any(dim=-2)
+    changed = td.clone()
+    changed[keys.SLOT_DESCRIPTOR] = torch.where(
+        unsensed.unsqueeze(-1), other[keys.SLOT_DESCRIPTOR], td[keys.SLOT_DESCRIPTOR]
+    )
+    changed[keys.SLOT_ACTIVE] = torch.where(unsensed, other[keys.SLOT_ACTIVE], td[keys.SLOT_ACTIVE])
+    assert torch.equal(model(td), model(changed))
+
+
+@settings(max_examples=30, deadline=None)
+@given(SIZES, SEEDS)
+def test_relabelling_slots_changes_nothing(sizes, seed):
+    model = encoder(torch.float64, seed)
+    td = observation((5,), *sizes, seed=seed, dtype=torch.float64)
+    order = torch.randperm(sizes[1])
+    relabelled = td.clone()
+    relabelled[keys.EDGE] = td[keys.EDGE][..., order]
+    relabelled[keys.SLOT_DESCRIPTOR] = td[keys.SLOT_DESCRIPTOR][..., order, :]
+    relabelled[keys.SLOT_ACTIVE] = td[keys.SLOT_ACTIVE][..., order]
+    torch.testing.assert_close(model(td), model(relabelled), rtol=1e-12, atol=1e-12)
+
+
+@settings(max_examples=20, deadline=None)
+@given(SIZES, SEEDS)
+def test_a_batch_of_one_equals_a_batch_of_many(sizes, seed):
+    model = encoder(torch.float64, seed)
+    td = observation((2, 3), *sizes, seed=seed, dtype=torch.float64)
+    together = model(td)
+    for index in itertools.product(range(2), range(3)):
+        torch.testing.assert_close(model(td[index]), together[index], rtol=1e-12, atol=1e-12)
+
+
+def test_no_edge_at_all_equals_no_slots():
+    model = encoder()
+    empty, without = observation((3,), 4, 6, sensed=0.0), observation((3,), 4, 0, sensed=0.0)
+    for key in (keys.AGENT_POSITION, keys.AGENT_VELOCITY, keys.PREVIOUS_ACTION, keys.TIP, keys.TARGET):
+        without[key] = empty[key]
+    assert torch.equal(model(empty), model(without))
+
+
+def test_an_edge_matters_only_with_stage_one():
+    td = observation((3,), 4, 6, sensed=1.0, discovered=1.0)
+    blind = td.clone()
+    blind[keys.EDGE] = torch.zeros_like(td[keys.EDGE])
+    assert not torch.allclose(encoder()(td), encoder()(blind))
+    assert torch.equal(encoder(stage1=False)(td), encoder(stage1=False)(blind))
+
+
+@pytest.mark.parametrize("entry", [keys.AGENT_POSITION, keys.AGENT_VELOCITY, keys.PREVIOUS_ACTION, keys.EDGE])
+@pytest.mark.parametrize("moved", range(6))
+def test_an_agent_reaches_as_many_neighbours_as_stage_two_has_layers(entry, moved):
+    td = observation((3,), 6, 5, sensed=0.5, discovered=1.0)
+    other = td.clone()
+    other[entry][:, moved] = ~td[entry][:, moved] if entry == keys.EDGE else td[entry][:, moved] + 1
+    for layers in (1, 2):
+        model = encoder(torch.float64, layers=layers)
+        changed = ((model(td.double()) - model(other.double())).abs() > 1e-13).any(dim=-1).any(dim=0)
+        assert changed.tolist() == [abs(agent - moved) <= layers for agent in range(6)]
+
+
+def test_without_stage_two_an_agent_hears_no_agent():
+    td = observation((3,), 6, 5)
+    other = td.clone()
+    other[keys.AGENT_POSITION][:, 2] += 1
+    model = encoder(stage2=False)
+    same = (model(td) == model(other)).all(dim=-1).all(dim=0)
+    assert same.tolist() == [True, True, False, True, True, True]
+
+
+@pytest.mark.parametrize("entry", [keys.TIP, keys.TARGET])
+def test_tip_and_target_are_shared_by_all_agents(entry):
+    td = observation((3,), 6, 5)
+    other = td.clone()
+    other[entry] += 1
+    assert (encoder()(td) != encoder()(other)).any(dim=-1).all()
+
+
+def test_every_parameter_but_the_type_pad_is_trained():
+    model = encoder()
+    model(observation((9,), 4, 6)).square().sum().backward()
+    for name, parameter in model.named_parameters():
+        assert parameter.grad is not None, name
+        used = parameter.grad.abs() > 0
+        if name == "types.weight":
+            assert used.any(dim=1).tolist() == [True, True, False]
+        elif name == "input.weight":  # all columns but the 7 reserved zeros
+            assert used.any(dim=0).tolist() == [True] * 15 + [False] * 7 + [True] * 3
+        else:
+            assert used.any(), name
+
+
+def test_parameters_may_be_batched_with_vmap():
+    """As the losses do with several critics."""
+    models = [encoder(torch.float64, seed) for seed in range(2)]
+    td = observation((3,), 4, 6, dtype=torch.float64)
+    parameters, buffers = torch.func.stack_module_state(models)
+
+    def call(parameters, buffers):
+        return torch.func.functional_call(models[0], (parameters, buffers), (td,))
+
+    together = torch.vmap(call)(parameters, buffers)
+    for model, out in zip(models, together, strict=True):
+        torch.testing.assert_close(out, model(td), rtol=1e-12, atol=1e-12)
