@@ -253,3 +253,16 @@ def test_moving_an_undiscovered_obstacle_changes_no_bit_of_any_action(build, set
         assert torch.equal(unchanged[key], moved[key]), key
     # the same test notices a change of what has been discovered
     assert not torch.equal(unchanged[keys.ACTION], seen[keys.ACTION])
+
+
+def test_staggered_episodes_are_truncated_at_different_steps_at_first_and_at_the_horizon_afterwards(build):
+    env = build("basic", num_envs=32, horizon=6, stagger=True, rod=RodParameters(substeps=1))
+    td, ends = env.reset(), []
+    for _ in range(12):
+        td, following = env.step_and_maybe_reset(td.set(keys.ACTION, torch.zeros(32, 6, 2)))
+        ends.append(td["next", "truncated"].squeeze(-1))
+        td = following
+    ends = torch.stack(ends)
+    assert torch.equal(ends[:6], ends[6:])  # once begun, every episode has its full length
+    assert (ends[:6].sum(dim=0) == 1).all()
+    assert (ends[:6].sum(dim=1) > 0).sum() >= 4

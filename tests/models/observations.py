@@ -60,6 +60,7 @@ def actor_config(**changes):
         "max_sigma": 2.0,
         "state_dependent_sigma": False,
         "mean_bound": 3.0,
+        "persistence": 0.0,
     }
     return ActorConfig(**(values | changes))
 

@@ -117,3 +117,13 @@ def test_the_value_pools_the_agents_mean():
 def test_actor_and_critic_share_no_parameter():
     policy, value = actor(), build_value(softgm_config(), 4, 6, value_config())
     assert not {id(p) for p in policy.parameters()} & {id(p) for p in value.parameters()}
+
+
+def test_persistence_mixes_the_previous_action_into_the_mean():
+    plain, persistent = actor(), actor(persistence=0.75)
+    data = observation((7,))
+    loc = plain(data.clone())[LOC]
+    previous = data[keys.PREVIOUS_ACTION].clamp(-0.99, 0.99).atanh()
+    torch.testing.assert_close(persistent(data.clone())[LOC], 0.25 * loc + 0.75 * previous)
+    with pytest.raises(ValueError, match=r"persistence=1\.0"):
+        actor(persistence=1.0)

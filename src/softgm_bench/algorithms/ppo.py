@@ -16,6 +16,7 @@ from softgm_bench.models.heads import STATE_VALUE, ActorConfig, ValueConfig, bui
 ADVANTAGE, VALUE_TARGET = "advantage", "value_target"
 # What an update reads of a frame; everything else stays out of the minibatches.
 TRAINED_ON = (*keys.OBSERVATION, keys.ACTION, keys.LOG_PROB, ADVANTAGE, VALUE_TARGET)
+REPORTED = ("loss_objective", "loss_critic", "loss_entropy", "entropy", "kl_approx", "clip_fraction")
 
 
 @dataclass
@@ -54,7 +55,6 @@ class PPO:
             self.policy,
             value,
             clip_epsilon=config.clip_epsilon,
-            entropy_bonus=config.entropy_coeff > 0.0,
             entropy_coeff=config.entropy_coeff,
             critic_coeff=config.critic_coeff,
             loss_critic_type="l2",
@@ -113,9 +113,7 @@ class PPO:
 
     def _step(self, minibatch: TensorDictBase) -> dict[str, Tensor]:
         losses = self.loss(minibatch)
-        total = losses["loss_objective"] + losses["loss_critic"]
-        if self.config.entropy_coeff > 0.0:
-            total = total + losses["loss_entropy"]
+        total = losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
         self.actor_optimizer.zero_grad(set_to_none=True)
         self.critic_optimizer.zero_grad(set_to_none=True)
         total.backward()
@@ -124,8 +122,7 @@ class PPO:
         critic_norm = torch.nn.utils.clip_grad_norm_(self._critic_parameters, limit)
         self.actor_optimizer.step()
         self.critic_optimizer.step()
-        names = ("loss_objective", "loss_critic", "loss_entropy", "entropy", "kl_approx", "clip_fraction")
-        metrics = {name: losses[name].detach() for name in names if name in losses.keys()}  # noqa: SIM118
+        metrics = {name: losses[name].detach() for name in REPORTED}
         return metrics | {"actor_grad_norm": actor_norm.detach(), "critic_grad_norm": critic_norm.detach()}
 
     def state_dict(self) -> dict[str, Any]:

@@ -17,11 +17,11 @@ def make_env(
     device: torch.device | str = "cpu",
     backend: str = "numba",
     dtype: torch.dtype = torch.float64,
+    stagger: bool = False,
 ) -> SoftArmEnv:
     """Build ``num_envs`` environments of one task; see ``SoftArmEnv`` for the arguments."""
-    return SoftArmEnv(
-        make_task(task_config), make_backend(backend, rod_parameters), num_envs, seed, horizon, device, dtype
-    )
+    rod = make_backend(backend, rod_parameters)
+    return SoftArmEnv(make_task(task_config), rod, num_envs, seed, horizon, device, dtype, stagger)
 
 
 __all__ = ["SoftArmEnv", "make_env"]

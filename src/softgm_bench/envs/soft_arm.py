@@ -70,6 +70,7 @@ class SoftArmEnv(EnvBase):
         horizon: int | None = None,
         device: torch.device | str = "cpu",
         dtype: torch.dtype = torch.float64,
+        stagger: bool = False,
     ) -> None:
         """Build the environments; the first ``reset`` draws their scenes.
 
@@ -81,6 +82,8 @@ class SoftArmEnv(EnvBase):
             horizon: control steps until truncation, the task's by default.
             device: of the simulation and of all entries.
             dtype: of the rod's state; entries that policies read are float32.
+            stagger: a full reset starts the episodes' clocks at random steps, so that their truncations do not fall
+                together and every batch of training holds all phases of an episode.
         """
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
         config, parameters = task.config, backend.parameters
@@ -89,6 +92,7 @@ class SoftArmEnv(EnvBase):
         self.horizon = config.horizon if horizon is None else horizon
         self.n_agents: int = config.n_agents
         self.n_slots: int = config.slots if task.max_cylinders else 0
+        self.stagger = stagger
         self._dtype = dtype
         self._actuation = Actuation(
             parameters,
@@ -171,6 +175,8 @@ class SoftArmEnv(EnvBase):
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None:
             self._simulation = self._fresh(self.batch_size[0])
+            if self.stagger:
+                self._simulation.steps.random_(0, self.horizon, generator=self._generator)
         else:
             chosen = mask.reshape(-1).nonzero().squeeze(-1)
             if len(chosen):

@@ -114,12 +114,12 @@ def _begin(config: Config) -> Run:
     set_threads(config.threads)
     torch.manual_seed(seeds.torch)
     experiment = config.experiment
-    env = _make_env(config, experiment.num_envs, seeds.training, experiment.train_horizon)
+    env = _make_env(config, experiment.num_envs, seeds.training, experiment.train_horizon, stagger=True)
     algorithm = PPO(config.algo, config.model, env)
     return Run(config, folder, seeds, env, algorithm, EpisodeTracker(experiment.num_envs, config.device), started)
 
 
-def _make_env(config: Config, num_envs: int, seed: int, horizon: int | None) -> SoftArmEnv:
+def _make_env(config: Config, num_envs: int, seed: int, horizon: int | None, stagger: bool = False) -> SoftArmEnv:
     return make_env(
         config.task,
         config.rod,
@@ -128,6 +128,7 @@ def _make_env(config: Config, num_envs: int, seed: int, horizon: int | None) -> 
         horizon=horizon,
         device=config.device,
         backend=config.backend,
+        stagger=stagger,
     )
 
 

@@ -41,6 +41,8 @@ class ActorConfig:
         max_sigma: upper bound of the standard deviation.
         state_dependent_sigma: sigma is an output of the network instead of the paper's free parameter.
         mean_bound: bound b of the pre-tanh mean, applied as b tanh(mu / b).
+        persistence: share p of the previous action in the pre-tanh mean, ``p atanh(a_{t-1}) + (1 - p) mu`` (paper: 0).
+            Above 0, exploration is correlated in time: it moves a slow arm where independent noise only shakes it.
     """
 
     widths: list[int]
@@ -49,6 +51,7 @@ class ActorConfig:
     max_sigma: float
     state_dependent_sigma: bool
     mean_bound: float
+    persistence: float
 
 
 @dataclass
@@ -105,6 +108,9 @@ class GaussianPolicy(TensorDictModuleBase):
                 f"initial_sigma={config.initial_sigma} must lie between min_sigma={config.min_sigma} and "
                 f"max_sigma={config.max_sigma}, and all must be positive"
             )
+        if not 0.0 <= config.persistence < 1.0:
+            raise ValueError(f"persistence={config.persistence} must be at least 0 and below 1")
+        self.persistence = config.persistence
         self.low, self.range = math.log(config.min_sigma), math.log(config.max_sigma / config.min_sigma)
         fraction = torch.tensor((math.log(config.initial_sigma) - self.low) / self.range)
         self.sigma = nn.Parameter(fraction.logit().repeat(ACTIONS))
@@ -119,6 +125,10 @@ class GaussianPolicy(TensorDictModuleBase):
         loc, sigma = output[..., :ACTIONS], self.sigma
         if output.shape[-1] > ACTIONS:
             sigma = sigma + output[..., ACTIONS:]
+        if self.persistence:
+            # the previous action before its tanh; near the bound it is cut, where atanh has no finite value
+            previous = td.get(keys.PREVIOUS_ACTION).clamp(-0.99, 0.99).atanh()
+            loc = torch.lerp(loc, previous, self.persistence)
         td.set(LOC, loc)
         td.set(SCALE, (self.low + self.range * sigma.sigmoid()).exp().expand_as(loc))
         return td
