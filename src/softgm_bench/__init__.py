@@ -7,6 +7,5 @@ __version__ = "0.1.0"
 # Idle OpenMP threads of torch spin for milliseconds by default, which slows processes that share cores (a sweep, an
 # evaluation beside a training) tens of times; sleeping at once halves the speed of a process that is alone. Spinning
 # for microseconds loses neither. It counts only if set before torch is loaded.
-if set before torch is loaded.
 if "OMP_WAIT_POLICY" not in os.environ:
     os.environ.setdefault("GOMP_SPINCOUNT", "2000")

@@ -162,6 +162,7 @@ def validate(config: Config) -> None:
     if not config.run_dir:
         raise UserError("run_dir is empty: name a folder for the run")
     _validate_machine(config)
+    _validate_by_building(config)
 
 
 def available_threads() -> int:
@@ -188,6 +189,18 @@ def _validate_machine(config: Config) -> None:
         raise UserError(f"device={config.device}: backend=numba runs on the CPU; add backend=torch")
     if int(device.group(1) or 0) >= torch.cuda.device_count():
         raise UserError(f"device={config.device}: this machine has {torch.cuda.device_count()} CUDA devices")
+
+
+def _validate_by_building(config: Config) -> None:
+    """Draw one scene and build one network: what only they can refuse is refused before anything is written."""
+    from softgm_bench.envs import make_env
+    from softgm_bench.models.registry import build_encoder
+
+    try:
+        env = make_env(config.task, config.rod, 1, config.seed, device=config.device, backend=config.backend)
+        build_encoder(config.model, env.n_agents, env.n_slots)
+    except ValueError as error:
+        raise UserError(str(error)) from error
 
 
 def _group_schemas() -> dict[str, dict[str, type]]:

@@ -38,6 +38,25 @@ class PPOConfig:
     actor: ActorConfig
     critic: ValueConfig
 
+    def __post_init__(self) -> None:
+        """Refuse values that PPO cannot work with.
+
+        Raises:
+            ValueError: with one line naming the key, its value and what would be right.
+        """
+        for name in ("epochs", "minibatch_size"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"algo.{name} is {getattr(self, name)}: it must be at least 1")
+        for name in ("clip_epsilon", "max_grad_norm", "actor_lr", "critic_lr"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"algo.{name} is {getattr(self, name)}: it must be above 0")
+        for name in ("gamma", "gae_lambda"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ValueError(f"algo.{name} is {getattr(self, name)}: it must lie between 0 and 1")
+        for name in ("entropy_coeff", "critic_coeff"):
+            if not getattr(self, name) >= 0.0:
+                raise ValueError(f"algo.{name} is {getattr(self, name)}: it must not be negative")
+
 
 class PPO:
     """TorchRL's ``ClipPPOLoss`` and ``GAE`` with an optimiser each for actor and critic.

@@ -53,6 +53,22 @@ class ActorConfig:
     mean_bound: float
     persistence: float
 
+    def __post_init__(self) -> None:
+        """Refuse values that give no policy.
+
+        Raises:
+            ValueError: with one line naming the key, its value and what would be right.
+        """
+        if not 0.0 < self.min_sigma < self.initial_sigma < self.max_sigma:
+            raise ValueError(
+                f"algo.actor.initial_sigma is {self.initial_sigma}: it must lie between min_sigma {self.min_sigma} and "
+                f"max_sigma {self.max_sigma}, and all must be above 0"
+            )
+        if not self.mean_bound > 0.0:
+            raise ValueError(f"algo.actor.mean_bound is {self.mean_bound}: it must be above 0")
+        if not 0.0 <= self.persistence < 1.0:
+            raise ValueError(f"algo.actor.persistence is {self.persistence}: it must be at least 0 and below 1")
+
 
 @dataclass
 class ValueConfig:
@@ -103,13 +119,6 @@ class GaussianPolicy(TensorDictModuleBase):
         super().__init__()
         outputs = 2 * ACTIONS if config.state_dependent_sigma else ACTIONS
         self.head = AgentHead(encoder, config.widths, outputs, last_gain=0.01)
-        if not 0.0 < config.min_sigma < config.initial_sigma < config.max_sigma:
-            raise ValueError(
-                f"initial_sigma={config.initial_sigma} must lie between min_sigma={config.min_sigma} and "
-                f"max_sigma={config.max_sigma}, and all must be positive"
-            )
-        if not 0.0 <= config.persistence < 1.0:
-            raise ValueError(f"persistence={config.persistence} must be at least 0 and below 1")
         self.persistence = config.persistence
         self.low, self.range = math.log(config.min_sigma), math.log(config.max_sigma / config.min_sigma)
         fraction = torch.tensor((math.log(config.initial_sigma) - self.low) / self.range)

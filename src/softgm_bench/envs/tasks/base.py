@@ -55,6 +55,24 @@ class TaskConfig:
     actuation: ActuationConfig
     reward: RewardConfig
 
+    def __post_init__(self) -> None:
+        """Refuse values that describe no task.
+
+        Raises:
+            ValueError: with one line naming the key, its value and what would be right.
+        """
+        for name, lowest in (("n_agents", 1), ("horizon", 1), ("slots", 0)):
+            if getattr(self, name) < lowest:
+                raise ValueError(f"task.{name} is {getattr(self, name)}: it must be at least {lowest}")
+        for name in ("success_radius", "sensing_radius", "bin_length"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"task.{name} is {getattr(self, name)}: it must be above 0")
+        if not 0.0 <= self.min_dilatation < 1.0 < self.max_dilatation:
+            raise ValueError(
+                f"task.min_dilatation is {self.min_dilatation}, task.max_dilatation {self.max_dilatation}: "
+                "1, the dilatation at rest, must lie between them"
+            )
+
 
 class Scene(TensorClass):
     """What is drawn at a reset; ``batch_size`` is ``(num_envs,)``.
