@@ -128,3 +128,12 @@ def test_the_value_of_a_state_is_one_number_for_the_team(build):
     assert frames[ADVANTAGE].shape == (len(frames), 6, 1)
     assert (frames[ADVANTAGE] == frames[ADVANTAGE][:, :1]).all()
     assert abs(frames[ADVANTAGE].mean().item()) < 1e-5
+
+
+def test_the_actors_learning_rate_falls_until_updates_stay_near_the_target_and_never_exceeds_its_setting(build):
+    algorithm, env = build("basic", "algo.target_kl=1.0e-6", "algo.actor_lr=1.0e-3")
+    batch = collect(algorithm, env)
+    rates = [algorithm.update(batch)["actor_lr"] for _ in range(3)]
+    assert rates == pytest.approx([1e-3 / 1.2, 1e-3 / 1.2**2, 1e-3 / 1.2**3])
+    patient, _ = build("basic", "algo.target_kl=1000.0", "algo.actor_lr=1.0e-3")
+    assert patient.update(batch)["actor_lr"] == 1e-3

@@ -105,6 +105,19 @@ def test_unknown_choices_list_the_known_ones():
         "experiment.checkpoint.interval=0",
         "experiment.checkpoint.keep=0",
         "rod.n_elements=1",
+        "task.n_agents=0",
+        "task.horizon=0",
+        "task.success_radius=0.0",
+        "task.min_dilatation=1.5",
+        "task.actuation.basis=linear",
+        "task.actuation.scaling=total",
+        "algo.epochs=0",
+        "algo.minibatch_size=0",
+        "algo.gamma=1.5",
+        "algo.actor_lr=0.0",
+        "algo.entropy_coeff=-1.0",
+        "algo.actor.initial_sigma=9.0",
+        "algo.actor.persistence=1.0",
     ],
 )
 def test_values_without_sense_are_refused_by_name(override):
@@ -115,6 +128,16 @@ def test_values_without_sense_are_refused_by_name(override):
 
     assert str(caught.value).startswith(key)
     assert value.strip("'") in str(caught.value)
+
+
+def test_what_only_building_the_environment_or_the_model_can_refuse_is_refused_with_the_rest():
+    for overrides, message in (
+        (["task=wall", "task.max_path=0.1"], "no admissible pair of opening and target"),
+        (["task=wall", "task.opening_side=2.0"], "task.opening_z"),
+        (["model.heads=3"], "heads=3"),
+    ):
+        with pytest.raises(UserError, match=message):
+            compose(overrides)
 
 
 def test_unreadable_and_dangling_overrides_are_one_line():

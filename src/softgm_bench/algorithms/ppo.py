@@ -1,6 +1,5 @@
 """Proximal policy optimisation for a team: one reward and one state value, one probability ratio per agent."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +16,7 @@ ADVANTAGE, VALUE_TARGET = "advantage", "value_target"
 # What an update reads of a frame; everything else stays out of the minibatches.
 TRAINED_ON = (*keys.OBSERVATION, keys.ACTION, keys.LOG_PROB, ADVANTAGE, VALUE_TARGET)
 REPORTED = ("loss_objective", "loss_critic", "loss_entropy", "entropy", "kl_approx", "clip_fraction")
+LR_MARGIN, LR_FACTOR = 1.5, 1.2  # of the actor's learning rate's adaptation to ``target_kl``
 
 
 @dataclass
@@ -32,6 +32,7 @@ class PPOConfig:
     max_grad_norm: float
     actor_lr: float
     critic_lr: float
+    target_kl: float | None
     epochs: int
     minibatch_size: int
     normalize_advantage: bool
@@ -50,6 +51,8 @@ class PPOConfig:
         for name in ("clip_epsilon", "max_grad_norm", "actor_lr", "critic_lr"):
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"algo.{name} is {getattr(self, name)}: it must be above 0")
+        if self.target_kl is not None and not self.target_kl > 0.0:
+            raise ValueError(f"algo.target_kl is {self.target_kl}: it must be above 0, or null")
         for name in ("gamma", "gae_lambda"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"algo.{name} is {getattr(self, name)}: it must lie between 0 and 1")
@@ -99,13 +102,11 @@ class PPO:
             Means over all minibatches of losses, entropy, KL divergence, clip fraction and gradient norms.
         """
         frames = self.prepare(batch)
-        totals: dict[str, Tensor] = {}
-        count = 0
-        for minibatch in self._minibatches(frames):
-            for name, value in self._step(minibatch).items():
-                totals[name] = totals.get(name, torch.zeros_like(value)) + value
-            count += 1
-        return {name: float(total) / count for name, total in totals.items()}
+        epochs = [self._epoch(frames) for _ in range(self.config.epochs)]
+        if self.config.target_kl is not None:
+            self._adapt_actor_lr(epochs[-1]["kl_approx"], self.config.target_kl)
+        means = {name: sum(epoch[name] for epoch in epochs) / len(epochs) for name in epochs[0]}
+        return means | {"actor_lr": self.actor_optimizer.param_groups[0]["lr"]}
 
     def prepare(self, batch: TensorDictBase) -> TensorDictBase:
         """Estimate advantages and value targets, and flatten to frames ``(num_envs * steps,)``.
@@ -121,14 +122,29 @@ class PPO:
         n_agents = frames.get(keys.LOG_PROB).shape[-1]
         return frames.set(ADVANTAGE, advantage.unsqueeze(-2).expand(-1, n_agents, 1))
 
-    def _minibatches(self, frames: TensorDictBase) -> Iterator[TensorDictBase]:
-        size = self.config.minibatch_size
-        for _ in range(self.config.epochs):
-            order = torch.randperm(len(frames), device=frames.device)
-            for chosen in order.split(size):
-                # a rest much smaller than a minibatch would weigh its few frames too much
-                if 2 * len(chosen) >= min(size, len(frames)):
-                    yield frames[chosen]
+    def _epoch(self, frames: TensorDictBase) -> dict[str, float]:
+        """Pass once over all frames in random minibatches; means over the minibatches."""
+        totals: dict[str, Tensor] = {}
+        count, size = 0, self.config.minibatch_size
+        for chosen in torch.randperm(len(frames), device=frames.device).split(size):
+            # a rest much smaller than a minibatch would weigh its few frames too much
+            if 2 * len(chosen) >= min(size, len(frames)):
+                for name, value in self._step(frames[chosen]).items():
+                    totals[name] = totals.get(name, torch.zeros_like(value)) + value
+                count += 1
+        return {name: float(total) / count for name, total in totals.items()}
+
+    def _adapt_actor_lr(self, kl: float, target: float) -> None:
+        """Keep the policy's change per update near ``target``, the mean KL divergence over the last epoch.
+
+        With a constant step the change grows as sigma shrinks, until updates undo each other. ``actor_lr`` is the
+        upper bound: above it, learning was slower even where the divergence was small.
+        """
+        for group in self.actor_optimizer.param_groups:
+            if kl > LR_MARGIN * target:
+                group["lr"] /= LR_FACTOR
+            elif kl < target / LR_MARGIN:
+                group["lr"] = min(group["lr"] * LR_FACTOR, self.config.actor_lr)
 
     def _step(self, minibatch: TensorDictBase) -> dict[str, Tensor]:
         losses = self.loss(minibatch)

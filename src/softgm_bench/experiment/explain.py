@@ -65,7 +65,9 @@ def _nearest(key: str, overrides: list[str]) -> str:
 
 def _valid_keys(overrides: list[str]) -> Iterator[str]:
     """Every key of the configuration that the chosen groups make up, dotted."""
-    choices = [override for override in overrides if re.fullmatch(r"(task|algo|model|experiment|rod)=\w+", override)]
+    choices = [
+        override for override in overrides if re.fullmatch(r"(task|algo|model|recipe|experiment|rod)=\w+", override)
+    ]
     try:
         config = compose_untyped(choices)
     except (HydraException, OmegaConfBaseException):
