@@ -17,6 +17,7 @@ TINY = [
     "experiment.steps_per_batch=4",
     "experiment.train_horizon=3",
     "experiment.evaluation.horizon=2",
+    "experiment.evaluation.final_horizon=2",
     "experiment.evaluation.final_episodes=2",
     "rod.n_elements=20",
     "algo.epochs=1",

@@ -32,6 +32,7 @@ class EvaluationConfig:
     final_episodes: int
     deterministic: bool
     horizon: int | None
+    final_horizon: int | None
 
 
 @dataclass
@@ -153,6 +154,7 @@ def validate(config: Config) -> None:
         "experiment.evaluation.episodes": evaluation.episodes,
         "experiment.evaluation.final_episodes": evaluation.final_episodes,
         "experiment.evaluation.horizon": evaluation.horizon,
+        "experiment.evaluation.final_horizon": evaluation.final_horizon,
         "experiment.checkpoint.interval": checkpoint.interval,
         "experiment.checkpoint.keep": checkpoint.keep,
     }

@@ -102,6 +102,7 @@ def test_unknown_choices_list_the_known_ones():
         "experiment.evaluation.episodes=0",
         "experiment.evaluation.final_episodes=0",
         "experiment.evaluation.horizon=0",
+        "experiment.evaluation.final_horizon=0",
         "experiment.checkpoint.interval=0",
         "experiment.checkpoint.keep=0",
         "rod.n_elements=1",

@@ -18,6 +18,7 @@ TINY = (
     "experiment.train_horizon=3",
     "experiment.evaluation.interval=16",
     "experiment.evaluation.horizon=2",
+    "experiment.evaluation.final_horizon=2",
     "experiment.evaluation.final_episodes=5",
     "rod.n_elements=20",
     "algo.epochs=2",

@@ -36,6 +36,7 @@ class PPOConfig:
     epochs: int
     minibatch_size: int
     normalize_advantage: bool
+    advantage_clip: float | None
     actor: ActorConfig
     critic: ValueConfig
 
@@ -51,8 +52,10 @@ class PPOConfig:
         for name in ("clip_epsilon", "max_grad_norm", "actor_lr", "critic_lr"):
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"algo.{name} is {getattr(self, name)}: it must be above 0")
-        if self.target_kl is not None and not self.target_kl > 0.0:
-            raise ValueError(f"algo.target_kl is {self.target_kl}: it must be above 0, or null")
+        for name in ("target_kl", "advantage_clip"):
+            value = getattr(self, name)
+            if value is not None and not value > 0.0:
+                raise ValueError(f"algo.{name} is {value}: it must be above 0, or null")
         for name in ("gamma", "gae_lambda"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"algo.{name} is {getattr(self, name)}: it must lie between 0 and 1")
@@ -118,7 +121,11 @@ class PPO:
         frames = batch.select(*TRAINED_ON).reshape(-1)
         advantage = frames.get(ADVANTAGE)
         if self.config.normalize_advantage:
-            advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+            advantage = _standardised(advantage)
+        if self.config.advantage_clip is not None:
+            # a few successes among thousands of frames would otherwise leave nothing of all the other frames' say
+            limit = self.config.advantage_clip
+            advantage = _standardised(advantage.clamp(-limit, limit))
         n_agents = frames.get(keys.LOG_PROB).shape[-1]
         return frames.set(ADVANTAGE, advantage.unsqueeze(-2).expand(-1, n_agents, 1))
 
@@ -173,3 +180,7 @@ class PPO:
         self.loss.load_state_dict(state["loss"])
         self.actor_optimizer.load_state_dict(state["actor_optimizer"])
         self.critic_optimizer.load_state_dict(state["critic_optimizer"])
+
+
+def _standardised(values: Tensor) -> Tensor:
+    return (values - values.mean()) / (values.std() + 1e-8)

@@ -85,10 +85,11 @@ def _go(run: Run) -> EpisodeRecords:
         try:
             _learn(run, interruption, progress)
             _save(run)
-            episodes = config.experiment.evaluation.final_episodes
-            progress.say(f"final evaluation: {episodes} episodes")
+            settings = config.experiment.evaluation
+            progress.say(f"final evaluation: {settings.final_episodes} episodes")
             with interruption.at_once():
-                return _evaluate(run, episodes, run.seeds.final_evaluation)
+                seed = run.seeds.final_evaluation
+                return _evaluate(run, settings.final_episodes, seed, settings.final_horizon)
         except Interrupted as stop:
             stop.args = (f"interrupted after {run.frames} frames; checkpoint: {_save(run)}",)
             raise
@@ -192,15 +193,16 @@ def _row(run: Run, batch: TensorDictBase, losses: dict[str, float], seconds: flo
     }
 
 
-def _evaluate(run: Run, episodes: int, seed: int) -> EpisodeRecords:
-    settings = run.config.experiment.evaluation
-    env = _make_env(run.config, episodes, seed, settings.horizon)
-    return evaluate(run.algorithm.policy, env, deterministic=settings.deterministic, seed=seed)
+def _evaluate(run: Run, episodes: int, seed: int, horizon: int | None) -> EpisodeRecords:
+    env = _make_env(run.config, episodes, seed, horizon)
+    deterministic = run.config.experiment.evaluation.deterministic
+    return evaluate(run.algorithm.policy, env, deterministic=deterministic, seed=seed)
 
 
 def _evaluate_in_training(run: Run, interruption: Interruption, progress: Progress) -> None:
     with interruption.at_once():
-        records = _evaluate(run, run.config.experiment.evaluation.episodes, run.seeds.evaluation)
+        settings = run.config.experiment.evaluation
+        records = _evaluate(run, settings.episodes, run.seeds.evaluation, settings.horizon)
     run.evaluations += 1
     metrics = summarise(records)
     at = {"evaluation": run.evaluations, "iteration": run.iteration, "frames": run.frames, "wall_time": run.wall_time}
