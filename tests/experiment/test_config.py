@@ -118,7 +118,7 @@ def test_unknown_choices_list_the_known_ones():
         "algo.actor_lr=0.0",
         "algo.entropy_coeff=-1.0",
         "algo.actor.initial_sigma=9.0",
-        "algo.actor.persistence=1.5",
+        "algo.actor.persistence=1.0",
     ],
 )
 def test_values_without_sense_are_refused_by_name(override):

@@ -124,6 +124,6 @@ def test_persistence_mixes_the_previous_action_into_the_mean():
     data = observation((7,))
     loc = plain(data.clone())[LOC]
     previous = data[keys.PREVIOUS_ACTION].clamp(-0.99, 0.99).atanh()
-    torch.testing.assert_close(persistent(data.clone())[LOC], loc + 0.75 * previous)
-    with pytest.raises(ValueError, match=r"persistence is 1\.5"):
-        actor(persistence=1.5)
+    torch.testing.assert_close(persistent(data.clone())[LOC], 0.25 * loc + 0.75 * previous)
+    with pytest.raises(ValueError, match=r"persistence is 1\.0"):
+        actor(persistence=1.0)

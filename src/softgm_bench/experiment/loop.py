@@ -1,4 +1,4 @@
-"""One run: collect, update, evaluate, write down; SPEC sections 6 and 8."""
+"""One run: collect, update, evaluate, write down."""
 
 import time
 from collections.abc import Iterator

@@ -41,9 +41,8 @@ class ActorConfig:
         max_sigma: upper bound of the standard deviation.
         state_dependent_sigma: sigma is an output of the network instead of the paper's free parameter.
         mean_bound: bound b of the pre-tanh mean, applied as b tanh(mu / b).
-        persistence: factor p of the previous action in the pre-tanh mean, ``mu + p atanh(a_{t-1})``, 0 to 1 (paper: 0).
-            Above 0, exploration is correlated in time: it moves a slow arm where independent noise only shakes it. At
-            1 the network says how the torque is to change, which needs no exact inverse of the arm's statics.
+        persistence: share p of the previous action in the pre-tanh mean, ``p atanh(a_{t-1}) + (1 - p) mu`` (paper: 0).
+            Above 0, exploration is correlated in time: it moves a slow arm where independent noise only shakes it.
     """
 
     widths: list[int]
@@ -67,8 +66,8 @@ class ActorConfig:
             )
         if not self.mean_bound > 0.0:
             raise ValueError(f"algo.actor.mean_bound is {self.mean_bound}: it must be above 0")
-        if not 0.0 <= self.persistence <= 1.0:
-            raise ValueError(f"algo.actor.persistence is {self.persistence}: it must lie between 0 and 1")
+        if not 0.0 <= self.persistence < 1.0:
+            raise ValueError(f"algo.actor.persistence is {self.persistence}: it must be at least 0 and below 1")
 
 
 @dataclass

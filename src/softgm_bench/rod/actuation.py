@@ -1,4 +1,4 @@
-"""From N control-point amplitudes to a distributed couple along the rod (SPEC section 2; Naughton et al. 2021)."""
+"""From N control-point amplitudes to a distributed couple along the rod (Naughton et al. 2021)."""
 
 import numpy as np
 import torch

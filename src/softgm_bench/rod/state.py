@@ -47,7 +47,7 @@ def straight_rods(
     dtype: torch.dtype = torch.float64,
     device: torch.device | str = "cpu",
 ) -> RodState:
-    """Rods at rest: straight along +z from the origin with d1 = +y (SPEC section 1)."""
+    """Rods at rest: straight along +z from the origin with d1 = +y."""
     constants = rod_constants(parameters)
 
     def repeat(array) -> Tensor:

@@ -19,7 +19,7 @@ class BasicConfig(TaskConfig):
 
 
 class Basic(Task):
-    """Any azimuth; distance and polar angle from +z uniform in their ranges (SPEC section 3)."""
+    """Any azimuth; distance and polar angle from +z uniform in their ranges."""
 
     config_class = BasicConfig
 

@@ -21,7 +21,7 @@ class StructuredConfig(TaskConfig):
 
 
 class Structured(Task):
-    """The posts stand still; only the target is drawn (SPEC section 3)."""
+    """The posts stand still; only the target is drawn."""
 
     config_class = StructuredConfig
     max_cylinders = 2

@@ -32,7 +32,7 @@ class Wall(Task):
     """Columns whose axis lies within half a side of the opening's centre are cut above and below it.
 
     Opening and target are drawn independently and redrawn together until the way from the base through the opening's
-    centre to the target is at most ``max_path`` long (SPEC section 3).
+    centre to the target is at most ``max_path`` long.
     """
 
     config_class = WallConfig
