@@ -81,7 +81,7 @@ def test_unknown_choices_list_the_known_ones():
     assert refusal("task=wal") == f"task=wal: no such task; choose one of {tasks}"
     assert refusal("experiment=fast") == "experiment=fast: no such experiment; choose one of default, quick, smoke"
     assert refusal("model=cnn") == "model=cnn: no such model; choose one of mlp, softgm"
-    assert refusal("task=common").startswith("task.name=None: no such task; choose one of basic, ")
+    assert refusal("task=common").startswith("task=common: no such task; choose one of basic, ")
 
 
 @pytest.mark.parametrize(

@@ -2,13 +2,13 @@
 
 import difflib
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
-from softgm_bench.config import UserError, compose_untyped, config_directory
+from softgm_bench.config import UserError, compose_untyped
 
 USER_ERRORS = (UserError, HydraException, OmegaConfBaseException, OSError)
 
@@ -17,7 +17,7 @@ def explain(error: Exception, overrides: list[str]) -> str:
     """One line for an error of a type in ``USER_ERRORS``; ``overrides`` is the command line that led to it."""
     if isinstance(error, MissingConfigException) and error.options is not None:
         group, _, name = str(error.missing_cfg_file).rpartition("/")
-        return f"{group}={name}: no such {group}; choose one of {', '.join(_choices(group, error.options))}"
+        return f"{group}={name}: no such {group}; choose one of {', '.join(sorted(error.options))}"
     cause = _omegaconf_error(error)
     if isinstance(cause, ConfigKeyError | ConfigAttributeError):
         return f"{cause.full_key}: no such key; {_nearest(str(cause.full_key), overrides)}"
@@ -28,16 +28,6 @@ def explain(error: Exception, overrides: list[str]) -> str:
     if type(error).__name__ == "OverrideParseException":
         return f"{_first_line(error)}: settings are written key=value"
     return _first_line(error)
-
-
-def _choices(group: str, options: Sequence[str]) -> list[str]:
-    """Options of a group that can be chosen; a task's file that others share has no name of its own."""
-    files = {option: config_directory() / group / f"{option}.yaml" for option in sorted(options)}
-    return [
-        option
-        for option, file in files.items()
-        if group != "task" or not file.exists() or "name" in OmegaConf.load(file)
-    ]
 
 
 def _omegaconf_error(error: BaseException) -> OmegaConfBaseException | None:
