@@ -137,3 +137,13 @@ def test_the_actors_learning_rate_falls_until_updates_stay_near_the_target_and_n
     assert rates == pytest.approx([1e-3 / 1.2, 1e-3 / 1.2**2, 1e-3 / 1.2**3])
     patient, _ = build("basic", "algo.target_kl=1000.0", "algo.actor_lr=1.0e-3")
     assert patient.update(batch)["actor_lr"] == 1e-3
+
+
+def test_clipped_advantages_are_standardised_again_only_if_they_were_before(build):
+    raw = build("basic", "algo.normalize_advantage=false", "algo.advantage_clip=0.05")
+    advantage = raw[0].prepare(collect(*raw))[ADVANTAGE]
+    assert advantage.abs().max() == pytest.approx(0.05)
+    standardised = build("basic", "algo.advantage_clip=0.5")
+    advantage = standardised[0].prepare(collect(*standardised))[ADVANTAGE][:, 0]
+    assert advantage.mean().abs() < 1e-5
+    assert advantage.std() == pytest.approx(1.0, abs=1e-4)

@@ -125,7 +125,9 @@ class PPO:
         if self.config.advantage_clip is not None:
             # a few successes among thousands of frames would otherwise leave nothing of all the other frames' say
             limit = self.config.advantage_clip
-            advantage = _standardised(advantage.clamp(-limit, limit))
+            advantage = advantage.clamp(-limit, limit)
+            if self.config.normalize_advantage:
+                advantage = _standardised(advantage)
         n_agents = frames.get(keys.LOG_PROB).shape[-1]
         return frames.set(ADVANTAGE, advantage.unsqueeze(-2).expand(-1, n_agents, 1))
 
