@@ -21,14 +21,13 @@ import numpy as np
 import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "rod"))
-from pyelastica_oracle import Loads, Post, build
+from pyelastica_oracle import UP, Loads, Post, as_cylinders, build
 
 from softgm_bench.rod.backend import make_backend
 from softgm_bench.rod.parameters import RodParameters
-from softgm_bench.rod.state import Cylinders, straight_rods
+from softgm_bench.rod.state import straight_rods
 
 ARM = RodParameters()
-UP = (0.0, 0.0, 1.0)
 SCENES = {
     "no obstacle": (),
     "two posts": tuple(Post((0.35, y, -0.2), UP, 1.2, 0.05) for y in (-0.16, 0.16)),
@@ -36,24 +35,6 @@ SCENES = {
 }
 COUPLE = np.zeros((3, ARM.n_elements))
 COUPLE[1] = 4.0 / ARM.n_elements  # leans sideways, in free space
-
-
-def cylinders(posts: tuple[Post, ...], num_envs: int, dtype: torch.dtype) -> Cylinders | None:
-    if not posts:
-        return None
-
-    def repeat(values) -> torch.Tensor:
-        tensor = torch.tensor(values, dtype=dtype)
-        return tensor.expand(num_envs, *tensor.shape)
-
-    return Cylinders(
-        start=repeat([post.start for post in posts]),
-        axis=repeat([post.axis for post in posts]),
-        length=repeat([post.length for post in posts]),
-        radius=repeat([post.radius for post in posts]),
-        mask=torch.ones((num_envs, len(posts)), dtype=torch.bool),
-        batch_size=[num_envs],
-    )
 
 
 def pyelastica_rate(posts: tuple[Post, ...], control_steps: int) -> float:
@@ -72,7 +53,7 @@ def our_rate(backend: str, posts: tuple[Post, ...], num_envs: int, dtype: torch.
     """Substeps per second over all rods."""
     rod = make_backend(backend, ARM)
     couple = torch.as_tensor(COUPLE, dtype=dtype).expand(num_envs, -1, -1).contiguous()
-    obstacles = cylinders(posts, num_envs, dtype)
+    obstacles = as_cylinders([posts] * num_envs, dtype) if posts else None
     state = rod.control_step(straight_rods(ARM, num_envs, dtype), couple, cylinders=obstacles, substeps=2)
     start = time.perf_counter()
     for _ in range(control_steps):

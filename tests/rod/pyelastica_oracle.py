@@ -7,11 +7,14 @@ from typing import NamedTuple
 import elastica as ea
 import elastica.contact_forces
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from softgm_bench.rod.parameters import RodParameters
+from softgm_bench.rod.state import Cylinders
 
 Array = NDArray[np.float64]
+UP = (0.0, 0.0, 1.0)
 
 
 class Post(NamedTuple):
@@ -153,3 +156,16 @@ def _add_fixed_cylinder(simulator: _Simulator, rod: ea.CosseratRod, post: Post, 
         velocity_damping_coefficient=parameters.velocity_damping_coefficient,
         friction_coefficient=parameters.friction_coefficient,
     )
+
+
+def as_cylinders(per_environment: Sequence[Sequence[Post]], dtype: torch.dtype = torch.float64) -> Cylinders:
+    """Pad with masked cylinders to the longest list."""
+    size = max(map(len, per_environment))
+    filler = Post((0.0, 0.0, 0.0), UP, 1.0, 1.0)  # as wide as the arm is long: an unread mask would show
+    padded = [[*posts, *[filler] * (size - len(posts))] for posts in per_environment]
+    fields = {
+        name: torch.tensor([[getattr(post, name) for post in posts] for posts in padded], dtype=dtype)
+        for name in Post._fields
+    }
+    mask = torch.tensor([[i < len(posts) for i in range(size)] for posts in per_environment])
+    return Cylinders(**fields, mask=mask, batch_size=[len(padded)])

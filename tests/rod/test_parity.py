@@ -7,13 +7,12 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from pyelastica_oracle import Array, Post, Trajectory, simulate
+from pyelastica_oracle import UP, Array, Post, Trajectory, as_cylinders, simulate
 
 from softgm_bench.rod.parameters import RodParameters
 from softgm_bench.rod.state import Cylinders, RodState, straight_rods
 from softgm_bench.rod.torch_backend import TorchBackend
 
-UP = (0.0, 0.0, 1.0)
 TWO_POSTS = tuple(Post((0.35, y, -0.2), UP, 1.2, 0.05) for y in (-0.16, 0.16))
 # The eight columns of the wall that the arm can reach here.
 WALL = tuple(Post((0.4, y, -0.2), UP, 1.4, 0.04) for y in np.arange(-2, 6) * 0.08)
@@ -101,19 +100,6 @@ def oracle(name: str) -> Trajectory:
 
 def batch_of_one(array: Array | None) -> torch.Tensor | None:
     return None if array is None else torch.as_tensor(array)[None]
-
-
-def as_cylinders(per_environment: list[tuple[Post, ...]]) -> Cylinders:
-    """Pad with masked cylinders to the longest list."""
-    size = max(map(len, per_environment))
-    filler = Post((0.0, 0.0, 0.0), UP, 1.0, 1.0)  # as wide as the arm is long: an unread mask would show
-    padded = [[*posts, *[filler] * (size - len(posts))] for posts in per_environment]
-    fields = {
-        name: torch.tensor([[getattr(post, name) for post in posts] for posts in padded], dtype=torch.float64)
-        for name in Post._fields
-    }
-    mask = torch.tensor([[i < len(posts) for i in range(size)] for posts in per_environment])
-    return Cylinders(**fields, mask=mask, batch_size=[len(padded)])
 
 
 @pytest.mark.parametrize("name", CASES)
