@@ -210,12 +210,12 @@ class SoftArmEnv(EnvBase):
         now.table, new_bins = discover(before.table, sensed)
 
         distance = _distance(now)
-        success = distance < config.success_radius
+        success = (distance < config.success_radius) & ~diverged
         now.terminated = before.terminated | (active & (success | diverged))
         now.truncated = before.truncated | (active & (now.steps >= self.horizon) & ~now.terminated)
         info = self._info(
             now,
-            success=success & ~diverged,
+            success=success,
             diverged=diverged,
             tip_step=(now.rod.position[..., -1] - before.rod.position[..., -1]).norm(dim=-1),
             **self._torques(action),
@@ -228,7 +228,7 @@ class SoftArmEnv(EnvBase):
             previous_action=before.previous_action,
             contact_nodes=info["contact_nodes"].squeeze(-1),
             new_bins=new_bins,
-            success=success & ~diverged,
+            success=success,
         )
         self._simulation = now
         out = self._observe(now, sensed)

@@ -32,7 +32,7 @@ STATE_VALUE = "state_value"  # (B, 1)
 
 @dataclass
 class ActorConfig:
-    """The policy's head f_pi. Values: ``conf/model``.
+    """The policy's head f_pi. Values: ``conf/algo``.
 
     Attributes:
         widths: hidden layers, each followed by tanh.
@@ -72,7 +72,7 @@ class ActorConfig:
 
 @dataclass
 class ValueConfig:
-    """The critic's head f_V. Values: ``conf/model``.
+    """The critic's head f_V. Values: ``conf/algo``.
 
     Attributes:
         widths: hidden layers, each followed by tanh.

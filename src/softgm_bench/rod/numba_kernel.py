@@ -19,7 +19,7 @@ from numpy.polynomial import Chebyshev, Polynomial
 
 from softgm_bench.rod.numba_layout import Layout, make_layout
 
-# No NaN test happens inside the kernel, so "nnan" is safe; infinities and signed results stay IEEE.
+# No NaN test happens inside the kernel, so "nnan" is safe; infinities keep their IEEE meaning.
 FASTMATH = {"contract", "reassoc", "nsz", "nnan", "arcp"}
 
 TINY = 1e-14  # PyElastica adds it to lengths and angles
