@@ -74,6 +74,12 @@ def test_nodes_outnumber_elements_by_one():
     assert RodParameters(n_elements=9).n_nodes == 10
 
 
+def test_default_contact_is_pyelasticas_and_its_length_an_element_of_the_paper():
+    parameters = RodParameters()
+    assert parameters.contact_model == "pyelastica"
+    assert_allclose(rod_constants(parameters).rest_length, parameters.contact_length, rtol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("name", "value"),
     [
@@ -90,6 +96,9 @@ def test_nodes_outnumber_elements_by_one():
         ("contact_damping", float("nan")),
         ("friction_coefficient", -1.0),
         ("velocity_damping_coefficient", -1.0),
+        ("contact_length", 0.0),
+        ("contact_length", float("nan")),
+        ("contact_model", "hertz"),
         ("gravity", (0.0, -9.81)),
         ("damping_protocol", "viscous"),
     ],

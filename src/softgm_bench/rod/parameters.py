@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 DAMPING_PROTOCOLS = ("damping_constant", "uniform_damping_constant")
+CONTACT_MODELS = ("pyelastica", "exact")
 
 Array = NDArray[np.float64]
 
@@ -17,6 +18,10 @@ class RodParameters:
 
     ``damping_protocol`` names the form of PyElastica's ``AnalyticalLinearDamper`` that receives ``damping_constant``.
     One control step is ``substeps`` position-Verlet steps of ``dt`` seconds.
+
+    ``contact_model`` is ``pyelastica`` (``contact.py``) or ``exact`` (``exact_contact.py``). ``contact_stiffness``
+    (N/m), ``contact_damping`` and ``velocity_damping_coefficient`` (N s/m) act on each element in the first; in the
+    second they act on each ``contact_length`` metres of rest arc length, by default an element of the paper's arm.
     """
 
     n_elements: int = 60
@@ -32,6 +37,8 @@ class RodParameters:
     contact_damping: float = 50.0
     friction_coefficient: float = 0.0
     velocity_damping_coefficient: float = 0.0
+    contact_model: str = "pyelastica"
+    contact_length: float = 1.0 / 60.0
     dt: float = 4e-4
     substeps: int = 100
 
@@ -45,7 +52,15 @@ class RodParameters:
             raise ValueError(f"rod.n_elements is {self.n_elements}: a rod needs at least 2 elements")
         if self.substeps < 1:
             raise ValueError(f"rod.substeps is {self.substeps}: a control step needs at least 1 substep")
-        positive = ("base_length", "base_radius", "density", "youngs_modulus", "shear_modulus", "dt")
+        positive = (
+            "base_length",
+            "base_radius",
+            "density",
+            "youngs_modulus",
+            "shear_modulus",
+            "contact_length",
+            "dt",
+        )
         for name in positive:
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"rod.{name} is {getattr(self, name)}: it must be above 0")
@@ -65,6 +80,8 @@ class RodParameters:
             raise ValueError(
                 f"rod.damping_protocol is {self.damping_protocol!r}: choose one of {', '.join(DAMPING_PROTOCOLS)}"
             )
+        if self.contact_model not in CONTACT_MODELS:
+            raise ValueError(f"rod.contact_model is {self.contact_model!r}: choose one of {', '.join(CONTACT_MODELS)}")
 
     @property
     def n_nodes(self) -> int:
