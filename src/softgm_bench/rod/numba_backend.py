@@ -13,10 +13,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from softgm_bench.rod.numba_contact import COLUMNS, EDGE, NEXT_CHECK, RADIUS, START, make_contact
-from softgm_bench.rod.numba_kernel import jit, make_kernel
-from softgm_bench.rod.numba_layout import Layout, constant_rows, make_layout
-from softgm_bench.rod.parameters import RodParameters, rod_constants
+from softgm_bench.rod.numba_contact import COLUMNS, EDGE, NEXT_CHECK, RADIUS, START, make_contact, make_touch
+from softgm_bench.rod.numba_exact_contact import make_touch_exact
+from softgm_bench.rod.numba_kernel import jit, larger, make_kernel, make_straighten
+from softgm_bench.rod.numba_layout import CACHE_LINE, Layout, constant_rows, make_layout
+from softgm_bench.rod.parameters import CONTACT_MODELS, RodParameters, rod_constants
 from softgm_bench.rod.state import Cylinders, RodState, check_inputs
 
 
@@ -67,7 +68,7 @@ class NumbaBackend:
         table = _cylinder_table(cylinders, num_envs, dtype)
         if active is None:
             active = torch.ones(num_envs, dtype=torch.bool)
-        step = _make_step(n, arrays[0].dtype.type)
+        step = _make_step(n, arrays[0].dtype.type, self.parameters.contact_model)
         step(
             *arrays,
             couple.detach().to(dtype).contiguous().numpy(),
@@ -85,10 +86,17 @@ class NumbaBackend:
         if dtype not in self._tables:
             p = self.parameters
             real = torch.empty(0, dtype=dtype).numpy().dtype
-            rows = constant_rows(p, make_layout(p.n_elements), real)
+            rows = constant_rows(p, make_layout(p.n_elements, real.type), real)
             scalars = np.array([p.dt, self._constants.translational_decay, self._constants.volume.max()], dtype=real)
+            # the exact model's coefficients are densities along the rod
+            per = 1.0 if p.contact_model == "pyelastica" else p.contact_length
             contact = np.array(
-                [p.contact_stiffness, p.contact_damping, p.friction_coefficient, p.velocity_damping_coefficient],
+                [
+                    p.contact_stiffness / per,
+                    p.contact_damping / per,
+                    p.friction_coefficient,
+                    p.velocity_damping_coefficient / per,
+                ],
                 dtype=real,
             )
             self._tables[dtype] = rows, scalars, contact
@@ -108,19 +116,28 @@ def _cylinder_table(cylinders: Cylinders | None, num_envs: int, dtype: torch.dty
 
 
 @lru_cache
-def _make_step(n_elements: int, dtype: type) -> Callable[..., Any]:
-    """Compile the loop over environments and substeps for one element count and one precision."""
-    layout = make_layout(n_elements)
+def _make_step(n_elements: int, dtype: type, contact_model: str) -> Callable[..., Any]:
+    """Compile the loop over environments and substeps for one element count, precision and contact model."""
+    layout = make_layout(n_elements, dtype)
+    # Code on disk is found by the closure: what differs only in its callees must differ in the layout too.
+    layout = layout._replace(source=layout.source + CONTACT_MODELS.index(contact_model))
+    itemsize = np.dtype(dtype).itemsize
+    width = CACHE_LINE // itemsize
+    single = dtype is np.float32
 
     def control_step(
         position, director, velocity, omega, couple, force, cylinders, active, rows, scalars, contact, substeps
     ):
         for b in numba.prange(position.shape[0]):
             if active[b]:
-                s = np.empty(layout.size, rows.dtype)
+                memory = np.empty(layout.size + width, rows.dtype)
+                skip = (-memory.ctypes.data % CACHE_LINE) // itemsize
+                s = memory[skip : skip + layout.size]
                 s[:] = rows
                 load(s, position[b], director[b], velocity[b], omega[b], couple[b], force[b])
                 advance(s, cylinders[b], scalars, contact, substeps)
+                if single:
+                    straighten(s)
                 store(s, position[b], director[b], velocity[b], omega[b])
 
     return jit(
@@ -128,20 +145,22 @@ def _make_step(n_elements: int, dtype: type) -> Callable[..., Any]:
         parallel=True,
         load=_make_load(layout),
         store=_make_store(layout),
-        advance=_make_advance(layout, dtype),
+        advance=_make_advance(layout, dtype, contact_model),
+        straighten=make_straighten(layout, dtype),
     )
 
 
-def _make_advance(layout: Layout, real: type) -> Callable[..., Any]:
+def _make_advance(layout: Layout, real: type, contact_model: str) -> Callable[..., Any]:
     p, n = layout, layout.n
-    zero, half = real(0.0), real(0.5)
+    touch = (make_touch if contact_model == "pyelastica" else make_touch_exact)(layout, real)
+    zero, half, far = real(0.0), real(0.5), real(np.inf)
 
     def advance(s, cylinders, scalars, contact, substeps):
         dt, decay, volume = scalars[0], scalars[1], scalars[2]
-        touched = False
+        touched, soonest = False, -far
         fastest = zero
         for k in range(n + 1):
-            fastest = max(fastest, s[p.vx + k] ** 2 + s[p.vy + k] ** 2 + s[p.vz + k] ** 2)
+            fastest = larger(fastest, s[p.vx + k] ** 2 + s[p.vy + k] ** 2 + s[p.vz + k] ** 2)
         travelled = half * dt * np.sqrt(fastest)
         rotate(s, half * dt)
         move(s, half * dt)
@@ -149,22 +168,25 @@ def _make_advance(layout: Layout, real: type) -> Callable[..., Any]:
             stresses(s)
             couples(s)
             if cylinders.shape[0] > 0:
-                touching = add_contact(s, cylinders, travelled, contact, volume)
+                touching = False
+                extent = reach(s, volume)
+                if travelled + extent > soonest:
+                    touching, soonest = add_contact(s, cylinders, travelled, extent, contact, volume)
                 if touched and not touching:
                     for k in range(n + 1):
                         s[p.fx + k] = s[p.gx + k]
                         s[p.fy + k] = s[p.gy + k]
                         s[p.fz + k] = s[p.gz + k]
                 touched = touching
-            spin(s, dt)
-            fastest = push(s, dt, decay)
+            spin(s)
+            fastest = push(s, decay)
             # the half steps that end this substep and begin the next one are one
             step = half * dt if substep == substeps - 1 else dt
             travelled += step * np.sqrt(fastest)
             rotate(s, step)
             move(s, step)
 
-    return jit(advance, add_contact=make_contact(n, real), **make_kernel(n, real)._asdict())
+    return jit(advance, **make_contact(layout, real, touch)._asdict(), **make_kernel(n, real)._asdict())
 
 
 def _make_load(layout: Layout) -> Callable[..., Any]:

@@ -4,20 +4,19 @@
 """Rod-cylinder contact of the Numba kernel: PyElastica's ``RodCylinderContact`` without its pruning.
 
 A cylinder is looked at only when it might touch. When it is, the distance from its axis to the nearest element is
-stored; until the rod can have travelled that far, the cylinder costs one comparison a substep. Elements are then
-screened by a vectorised distance, and the few that may touch go through PyElastica's closest-point search. Both
-screens are bounds, so no contact is missed.
+stored; until the rod can have travelled that far, the cylinder costs nothing, and all of them together one comparison
+a substep. Elements are then screened by a vectorised distance, and the few that may touch go through PyElastica's
+closest-point search. Both screens are bounds, so no contact is missed.
 """
 
 from collections.abc import Callable
-from functools import lru_cache
 from math import sqrt
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from softgm_bench.rod.numba_kernel import jit
-from softgm_bench.rod.numba_layout import Layout, make_layout
+from softgm_bench.rod.numba_kernel import jit, larger
+from softgm_bench.rod.numba_layout import Layout
 
 # columns of a cylinder's row
 START, EDGE, RADIUS, NEXT_CHECK, COLUMNS = 0, 3, 6, 7, 8
@@ -25,44 +24,56 @@ START, EDGE, RADIUS, NEXT_CHECK, COLUMNS = 0, 3, 6, 7, 8
 STIFFNESS, DAMPING, FRICTION, SLIP_DAMPING = 0, 1, 2, 3
 
 
-@lru_cache
-def make_contact(n_elements: int, dtype: type) -> Callable[..., Any]:
-    """Compile ``add_contact`` for one element count and one precision."""
-    p, n, real = make_layout(n_elements), n_elements, dtype
+class Contact(NamedTuple):
+    """Compiled functions on one rod's buffer and its cylinders."""
 
-    def add_contact(s, cylinders, travelled, contact, volume):
-        """External force plus contact with every cylinder.
+    reach: Callable[..., Any]
+    add_contact: Callable[..., Any]
+
+
+def make_contact(layout: Layout, real: type, touch: Callable[..., Any]) -> Contact:
+    """Compile for one layout and one precision; ``touch`` is the force of one cylinder on one element."""
+    p, n = layout, layout.n
+    never = real(np.inf)
+
+    def add_contact(s, cylinders, travelled, extent, contact, volume):
+        """External force plus contact with every cylinder that is due.
 
         Args:
             s: the rod's buffer, with lengths of this substep.
             cylinders: ``(n_cylinders, 8)``; the last column, the travel at which the cylinder may touch, is updated.
             travelled: bound on how far any node has moved since the step began, m.
+            extent: of the elements at this substep, m, see ``reach``.
             contact: stiffness, damping, friction and slip damping coefficients.
             volume: largest element volume, m^3.
+
+        Returns:
+            Whether contact was added, and how far the rod must travel until any cylinder is due.
         """
-        extent = reach(s, volume)
-        copied = False
+        copied, soonest = False, never
         for c in range(cylinders.shape[0]):
             cylinder = cylinders[c]
-            if cylinder[NEXT_CHECK] > travelled + extent:
-                continue
-            gap = real(sqrt(nearest(s, cylinder))) - cylinder[RADIUS]
-            cylinder[NEXT_CHECK] = travelled + gap
-            if gap > extent:
-                continue
-            if not copied:
-                copied = True
-                for k in range(n + 1):
-                    s[p.fx + k] = s[p.gx + k]
-                    s[p.fy + k] = s[p.gy + k]
-                    s[p.fz + k] = s[p.gz + k]
-            limit = (extent + cylinder[RADIUS]) ** 2
-            for k in range(n):
-                if s[p.distance2 + k] <= limit:
-                    touch(s, k, cylinder, contact, volume)
-        return copied
+            if cylinder[NEXT_CHECK] < travelled + extent:
+                gap = real(sqrt(nearest(s, cylinder))) - cylinder[RADIUS]
+                cylinder[NEXT_CHECK] = travelled + gap
+                if gap <= extent:
+                    if not copied:
+                        copied = True
+                        for k in range(n + 1):
+                            s[p.fx + k] = s[p.gx + k]
+                            s[p.fy + k] = s[p.gy + k]
+                            s[p.fz + k] = s[p.gz + k]
+                    limit = (extent + cylinder[RADIUS]) ** 2
+                    for k in range(n):
+                        if s[p.distance2 + k] <= limit:
+                            touch(s, k, cylinder, contact, volume)
+            soonest = min(soonest, cylinder[NEXT_CHECK])
+        return copied, soonest
 
-    return jit(add_contact, reach=_make_reach(p, real), nearest=_make_nearest(p, real), touch=_make_touch(p, real))
+    return Contact(
+        reach=_make_reach(p, real),
+        add_contact=jit(add_contact, nearest=_make_nearest(p, real), touch=touch),
+    )
 
 
 def _make_reach(layout: Layout, real: type) -> Callable[..., Any]:
@@ -71,11 +82,11 @@ def _make_reach(layout: Layout, real: type) -> Callable[..., Any]:
 
     def reach(s, volume):
         """Bound on element radius plus length: no element reaches further from its midpoint."""
-        shortest, longest = s[p.length], s[p.length]
+        longest, shortest = s[p.length], -s[p.length]
         for k in range(n):
-            shortest = min(shortest, s[p.length + k])
-            longest = max(longest, s[p.length + k])
-        return real(sqrt(volume * inverse_pi / shortest)) + longest
+            longest = larger(longest, s[p.length + k])
+            shortest = larger(shortest, -s[p.length + k])
+        return real(sqrt(volume * inverse_pi / -shortest)) + longest
 
     return jit(reach)
 
@@ -89,7 +100,7 @@ def _make_nearest(layout: Layout, real: type) -> Callable[..., Any]:
         cx, cy, cz = cylinder[START], cylinder[START + 1], cylinder[START + 2]
         ex, ey, ez = cylinder[EDGE], cylinder[EDGE + 1], cylinder[EDGE + 2]
         inverse = one / (ex * ex + ey * ey + ez * ez)
-        smallest = far
+        smallest = -far
         for k in range(n):
             dx = half * (s[p.px + k] + s[p.px + k + 1]) - cx
             dy = half * (s[p.py + k] + s[p.py + k + 1]) - cy
@@ -100,16 +111,17 @@ def _make_nearest(layout: Layout, real: type) -> Callable[..., Any]:
             dz -= along * ez
             distance2 = dx * dx + dy * dy + dz * dz
             s[p.distance2 + k] = distance2
-            smallest = min(smallest, distance2)
-        return smallest
+            smallest = larger(smallest, -distance2)
+        return -smallest
 
     return jit(nearest)
 
 
-def _make_touch(layout: Layout, real: type) -> Callable[..., Any]:
+def make_touch(layout: Layout, real: type) -> Callable[..., Any]:
+    """Compile PyElastica's force of one cylinder on one element."""
     p, n = layout, layout.n
     zero, third, half, one, two = real(0.0), real(1.0 / 3.0), real(0.5), real(1.0), real(2.0)
-    inverse_pi, tiny = real(1.0 / np.pi), real(1e-14)
+    inverse_pi, tiny, smallest = real(1.0 / np.pi), real(1e-14), real(np.finfo(real).tiny)
 
     def touch(s, k, cylinder, contact, volume):
         """Force of one cylinder on one element (``_calculate_contact_forces_rod_cylinder``)."""
@@ -133,7 +145,7 @@ def _make_touch(layout: Layout, real: type) -> Callable[..., Any]:
         penetration = radius + cylinder[RADIUS] - distance
         if not penetration > zero:
             return
-        inverse = one / distance
+        inverse = one / max(distance, smallest)  # where the axes cross there is no direction, and no force
         dx, dy, dz = dx * inverse, dy * inverse, dz * inverse
         # velocity of the cylinder (at rest) relative to the element
         ux = -half * (s[p.vx + k] + s[p.vx + k + 1])

@@ -15,6 +15,8 @@ from typing import Any, NamedTuple
 
 import numba
 import numpy as np
+from llvmlite import ir
+from numba.extending import intrinsic
 from numpy.polynomial import Chebyshev, Polynomial
 
 from softgm_bench.rod.numba_layout import Layout, make_layout
@@ -54,6 +56,27 @@ def jit(function: Callable[..., Any], parallel: bool = False, **callees: Callabl
     return numba.njit(fastmath=FASTMATH, error_model="numpy", cache=True, parallel=parallel)(bound)
 
 
+@intrinsic
+def larger(typing_context, a, b):
+    """The larger of two numbers of one type, in a form that LLVM vectorises as a reduction (Python's ``max`` isn't)."""
+
+    def generate(context, builder, signature, arguments):
+        real = arguments[0].type
+        maxnum = builder.module.declare_intrinsic("llvm.maxnum", (real,), ir.FunctionType(real, [real, real]))
+        return builder.call(maxnum, arguments)
+
+    return a(a, a), generate
+
+
+def rounded(coefficients: tuple[float, ...], largest: float, real: type) -> tuple[Any, ...]:
+    """Coefficients of a polynomial in one precision, zero where their term is below round-off.
+
+    Multiplying by a constant zero costs nothing: the compiler drops it.
+    """
+    floor = 0.1 * float(np.finfo(real).eps) * abs(coefficients[0])
+    return tuple(real(c if abs(c) * largest**k > floor else 0.0) for k, c in enumerate(coefficients))
+
+
 class Kernel(NamedTuple):
     """Compiled functions on one rod's buffer."""
 
@@ -68,7 +91,7 @@ class Kernel(NamedTuple):
 @lru_cache
 def make_kernel(n_elements: int, dtype: type) -> Kernel:
     """Compile the loops for one element count and one precision."""
-    layout = make_layout(n_elements)
+    layout = make_layout(n_elements, dtype)
     return Kernel(
         stresses=_make_stresses(layout, dtype),
         couples=_make_couples(layout, dtype),
@@ -80,7 +103,7 @@ def make_kernel(n_elements: int, dtype: type) -> Kernel:
 
 
 def _make_stresses(layout: Layout, real: type) -> Callable[..., Any]:
-    p, n = layout, layout.n
+    p, n = layout, layout.elements
     one, tiny = real(1.0), real(TINY)
 
     def stresses(s):
@@ -129,10 +152,10 @@ def _make_stresses(layout: Layout, real: type) -> Callable[..., Any]:
 
 
 def _make_couples(layout: Layout, real: type) -> Callable[..., Any]:
-    p, n = layout, layout.n
-    one, half, quarter, three = real(1.0), real(0.5), real(0.25), real(3.0)
+    p, n = layout, layout.elements
+    one, half, quarter, zero = real(1.0), real(0.5), real(0.25), real(0.0)
     limit, tiny = real(SMALL_BEND), real(TINY)
-    b0, b1, b2, b3, b4, b5, b6, b7, b8, b9, b10, b11, b12 = (real(c) for c in BEND)
+    b0, b1, b2, b3, b4, b5, b6, b7, b8, b9, b10, b11, b12 = rounded(BEND, SMALL_BEND, real)
 
     def couples(s):
         """Curvature and bend/twist couple at interior nodes.
@@ -140,8 +163,8 @@ def _make_couples(layout: Layout, real: type) -> Callable[..., Any]:
         PyElastica: ``_inv_rotate``, ``_compute_internal_bending_twist_stresses_from_model`` and the Voronoi terms of
         ``_compute_internal_torques``.
         """
-        outside = 0
-        for k in range(n - 1):
+        sharpest = zero
+        for k in range(n):
             a00, a01, a02 = s[p.q00 + k], s[p.q01 + k], s[p.q02 + k]
             a10, a11, a12 = s[p.q10 + k], s[p.q11 + k], s[p.q12 + k]
             a20, a21, a22 = s[p.q20 + k], s[p.q21 + k], s[p.q22 + k]
@@ -156,8 +179,8 @@ def _make_couples(layout: Layout, real: type) -> Callable[..., Any]:
                 + (d10 * a10 + d11 * a11 + d12 * a12)
                 + (d20 * a20 + d21 * a21 + d22 * a22)
             )
-            y = quarter * (three - trace)
-            outside += y > limit
+            y = quarter * (s[p.three + k] - trace)
+            sharpest = larger(sharpest, y)
             # theta / sin(theta) as a polynomial of sin^2(theta / 2)
             ratio = b12
             ratio = ratio * y + b11
@@ -177,12 +200,12 @@ def _make_couples(layout: Layout, real: type) -> Callable[..., Any]:
             s[p.c1 + k] = x1 * scale
             s[p.c2 + k] = x2 * scale
             s[p.k0 + k] = y
-        if outside > 0:
+        if sharpest > limit:
             sharp_bends(s)
-        for k in range(n - 1):
+        for k in range(n):
             kappa0, kappa1, kappa2 = s[p.c0 + k], s[p.c1 + k], s[p.c2 + k]
-            dilatation = half * (s[p.length + k] + s[p.length + k + 1]) * s[p.inverse_voronoi + k]
-            inverse_cube = one / (dilatation * dilatation * dilatation)
+            inverse_dilatation = (s[p.voronoi + k] + s[p.voronoi + k]) / (s[p.length + k] + s[p.length + k + 1])
+            inverse_cube = inverse_dilatation * inverse_dilatation * inverse_dilatation
             tau0 = s[p.bend0 + k] * kappa0 * inverse_cube
             tau1 = s[p.bend0 + k] * kappa1 * inverse_cube
             tau2 = s[p.bend2 + k] * kappa2 * inverse_cube
@@ -196,7 +219,7 @@ def _make_couples(layout: Layout, real: type) -> Callable[..., Any]:
 
     def sharp(s):
         # Replace the polynomial where neighbouring directors differ by more than it covers.
-        for k in range(n - 1):
+        for k in range(n):
             y = s[p.k0 + k]
             if y > limit:
                 ratio = b12
@@ -212,19 +235,19 @@ def _make_couples(layout: Layout, real: type) -> Callable[..., Any]:
 
 
 def _make_spin(layout: Layout, real: type) -> Callable[..., Any]:
-    p, n = layout, layout.n
-    one, limit = real(1.0), real(SMALL_EXPONENT)
-    e0, e1, e2, e3, e4, e5, e6, e7, e8, e9, e10 = (real(c) for c in EXP)
+    p, n = layout, layout.elements
+    zero, one, limit = real(0.0), real(1.0), real(SMALL_EXPONENT)
+    e0, e1, e2, e3, e4, e5, e6, e7, e8, e9, e10 = rounded(EXP, SMALL_EXPONENT, real)
 
-    def spin(s, dt):
+    def spin(s):
         """Angular velocity of elements: dynamic step, clamped base, damper.
 
         PyElastica: ``_update_accelerations``, ``OneEndFixedBC``, ``AnalyticalLinearDamper``.
         """
-        outside = 0
+        largest = zero
         for k in range(n):
             x = s[p.decay_rate + k] * (one - s[p.dilatation + k])
-            outside += (x > limit) | (x < -limit)
+            largest = larger(largest, abs(x))
             factor = e10
             factor = factor * x + e9
             factor = factor * x + e8
@@ -237,15 +260,14 @@ def _make_spin(layout: Layout, real: type) -> Callable[..., Any]:
             factor = factor * x + e1
             factor = factor * x + e0
             s[p.length + k] = factor
-        if outside > 0:
+        if largest > limit:
             for k in range(n):
                 s[p.length + k] = real(exp(s[p.decay_rate + k] * (one - s[p.dilatation + k])))
         for k in range(n):
             factor = s[p.length + k]
             bending = s[p.decay0 + k] * factor * factor
-            step = dt * s[p.dilatation + k]
-            step0 = step / s[p.inertia0 + k]
-            step2 = step / s[p.inertia2 + k]
+            step0 = s[p.step0 + k] * s[p.dilatation + k]
+            step2 = s[p.step2 + k] * s[p.dilatation + k]
             m0 = s[p.m0 + k] + (s[p.c0 + k] - s[p.c0 + k - 1]) + (s[p.k0 + k] + s[p.k0 + k - 1])
             m1 = s[p.m1 + k] + (s[p.c1 + k] - s[p.c1 + k - 1]) + (s[p.k1 + k] + s[p.k1 + k - 1])
             m2 = s[p.m2 + k] + (s[p.c2 + k] - s[p.c2 + k - 1]) + (s[p.k2 + k] + s[p.k2 + k - 1])
@@ -258,18 +280,18 @@ def _make_spin(layout: Layout, real: type) -> Callable[..., Any]:
 
 
 def _make_rotate(layout: Layout, real: type) -> Callable[..., Any]:
-    p, n = layout, layout.n
-    one, limit = real(1.0), real(SMALL_TURN)
-    s0, s1, s2, s3, s4, s5, s6 = (real(c) for c in SINC)
-    c0, c1, c2, c3, c4, c5, c6 = (real(c) for c in COSC)
+    p, n = layout, layout.elements
+    zero, one, limit = real(0.0), real(1.0), real(SMALL_TURN)
+    s0, s1, s2, s3, s4, s5, s6 = rounded(SINC, SMALL_TURN, real)
+    c0, c1, c2, c3, c4, c5, c6 = rounded(COSC, SMALL_TURN, real)
 
     def rotate(s, dt):
         """Directors turn by ``dt * omega`` (Rodrigues). PyElastica: ``_get_rotation_matrix``."""
-        outside = 0
+        fastest = zero
         for k in range(n):
             a0, a1, a2 = dt * s[p.w0 + k], dt * s[p.w1 + k], dt * s[p.w2 + k]
             t = a0 * a0 + a1 * a1 + a2 * a2
-            outside += t > limit
+            fastest = larger(fastest, t)
             sinc = s6
             sinc = sinc * t + s5
             sinc = sinc * t + s4
@@ -286,7 +308,7 @@ def _make_rotate(layout: Layout, real: type) -> Callable[..., Any]:
             cosc = cosc * t + c0
             s[p.m0 + k] = sinc
             s[p.m1 + k] = cosc
-        if outside > 0:
+        if fastest > limit:
             for k in range(n):
                 a0, a1, a2 = dt * s[p.w0 + k], dt * s[p.w1 + k], dt * s[p.w2 + k]
                 t = a0 * a0 + a1 * a1 + a2 * a2
@@ -319,21 +341,21 @@ def _make_rotate(layout: Layout, real: type) -> Callable[..., Any]:
 
 
 def _make_push(layout: Layout, real: type) -> Callable[..., Any]:
-    p, n = layout, layout.n
+    p, nodes = layout, layout.nodes
     zero = real(0.0)
 
-    def push(s, dt, decay):
+    def push(s, decay):
         """Velocity of nodes: dynamic step, clamped base, damper. Returns the largest squared speed."""
         fastest = zero
-        for k in range(n + 1):
-            step = dt * s[p.inverse_mass + k]
+        for k in range(nodes):
+            step = s[p.node_step + k]
             vx = (s[p.vx + k] + step * (s[p.sx + k] - s[p.sx + k - 1] + s[p.fx + k])) * decay
             vy = (s[p.vy + k] + step * (s[p.sy + k] - s[p.sy + k - 1] + s[p.fy + k])) * decay
             vz = (s[p.vz + k] + step * (s[p.sz + k] - s[p.sz + k - 1] + s[p.fz + k])) * decay
             s[p.vx + k] = vx
             s[p.vy + k] = vy
             s[p.vz + k] = vz
-            fastest = max(fastest, vx * vx + vy * vy + vz * vz)
+            fastest = larger(fastest, vx * vx + vy * vy + vz * vz)
         s[p.vx] = s[p.vy] = s[p.vz] = zero
         return fastest
 
@@ -341,13 +363,44 @@ def _make_push(layout: Layout, real: type) -> Callable[..., Any]:
 
 
 def _make_move(layout: Layout, real: type) -> Callable[..., Any]:
-    p, n = layout, layout.n
+    p, nodes = layout, layout.nodes
 
     def move(s, dt):
         """Position of nodes: kinematic step."""
-        for k in range(n + 1):
+        for k in range(nodes):
             s[p.px + k] += dt * s[p.vx + k]
             s[p.py + k] += dt * s[p.vy + k]
             s[p.pz + k] += dt * s[p.vz + k]
 
     return jit(move)
+
+
+def make_straighten(layout: Layout, real: type) -> Callable[..., Any]:
+    """Compile ``straighten`` for one layout and one precision."""
+    p, n = layout, layout.elements
+    half, three = real(0.5), real(3.0)
+
+    def straighten(s):
+        """Make directors orthonormal to round-off again: one Newton step towards the nearest rotation.
+
+        Q becomes (3 - Q Q^T) Q / 2. PyElastica leaves directors to themselves. In float64 they stay within 1e-13; in
+        float32 what they lose in each of thousands of steps adds up, and the arm drifts with it.
+        """
+        for k in range(n):
+            a0, a1, a2 = s[p.q00 + k], s[p.q01 + k], s[p.q02 + k]
+            b0, b1, b2 = s[p.q10 + k], s[p.q11 + k], s[p.q12 + k]
+            c0, c1, c2 = s[p.q20 + k], s[p.q21 + k], s[p.q22 + k]
+            aa = half * (three - (a0 * a0 + a1 * a1 + a2 * a2))
+            bb = half * (three - (b0 * b0 + b1 * b1 + b2 * b2))
+            cc = half * (three - (c0 * c0 + c1 * c1 + c2 * c2))
+            ab = -half * (a0 * b0 + a1 * b1 + a2 * b2)
+            ac = -half * (a0 * c0 + a1 * c1 + a2 * c2)
+            bc = -half * (b0 * c0 + b1 * c1 + b2 * c2)
+            s[p.q00 + k], s[p.q01 + k] = aa * a0 + ab * b0 + ac * c0, aa * a1 + ab * b1 + ac * c1
+            s[p.q02 + k] = aa * a2 + ab * b2 + ac * c2
+            s[p.q10 + k], s[p.q11 + k] = ab * a0 + bb * b0 + bc * c0, ab * a1 + bb * b1 + bc * c1
+            s[p.q12 + k] = ab * a2 + bb * b2 + bc * c2
+            s[p.q20 + k], s[p.q21 + k] = ac * a0 + bc * b0 + cc * c0, ac * a1 + bc * b1 + cc * c1
+            s[p.q22 + k] = ac * a2 + bc * b2 + cc * c2
+
+    return jit(straighten)

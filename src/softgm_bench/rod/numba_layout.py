@@ -1,7 +1,9 @@
 """Where each quantity of one rod lies in the flat scratch buffer of the Numba kernel.
 
 All arrays of a rod share one buffer with compile-time offsets: LLVM then proves that they do not overlap and vectorises
-the loops over elements without run-time checks. Everything a substep touches (about 30 kB) stays in the L1 cache.
+the loops over elements without run-time checks. Everything a substep touches (about 30 kB in float64) stays in the L1
+cache. Rows begin on cache lines and loops run over whole vectors: the padding behind the last element or node holds
+constants of zero, so that whatever is computed there stays zero and no loop has a scalar remainder.
 """
 
 import hashlib
@@ -22,6 +24,8 @@ class Layout(NamedTuple):
 
     source: int  # digest of the kernel's source, so that machine code cached on disk never outlives it
     n: int  # elements
+    elements: int  # n rounded up to whole vectors: what loops over elements run over
+    nodes: int  # n + 1 rounded up likewise
     size: int  # entries of the whole buffer
     # state: position and velocity of nodes, director rows and angular velocity of elements
     px: int
@@ -59,11 +63,14 @@ class Layout(NamedTuple):
     shear2: int
     inertia0: int
     inertia2: int
-    inverse_mass: int
+    step0: int  # dt over inertia
+    step2: int
+    node_step: int  # dt over mass
     bend0: int  # on interior nodes
     bend2: int
     voronoi: int  # rest Voronoi lengths
     inverse_voronoi: int
+    three: int  # 3 on interior nodes: the trace of an identity
     decay0: int  # angular velocity's factor at dilatation 1
     decay2: int
     decay_rate: int  # its exponent per unit of (dilatation - 1), twist
@@ -85,20 +92,27 @@ class Layout(NamedTuple):
     distance2: int  # squared distance of elements to a cylinder's axis
 
 
-def make_layout(n_elements: int) -> Layout:
-    """Lay the rows out for a rod of ``n_elements``."""
-    names = Layout._fields[3:]
-    # An odd multiple of 64 bytes (float64) keeps rows from falling into the same cache sets.
-    stride = -(-(n_elements + 3) // 8) * 8
-    if (stride // 8) % 2 == 0:
-        stride += 8
-    offsets = {name: row * stride + 1 for row, name in enumerate(names)}
-    return Layout(source=_source_digest(), n=n_elements, size=stride * len(names), **offsets)
+CACHE_LINE = 64  # bytes; also the widest vector
+
+
+def make_layout(n_elements: int, dtype: type) -> Layout:
+    """Lay the rows out for a rod of ``n_elements`` in one precision."""
+    width = CACHE_LINE // np.dtype(dtype).itemsize
+    names = Layout._fields[5:]
+    elements, nodes = (-(-count // width) * width for count in (n_elements, n_elements + 1))
+    # Index -1 and index ``elements`` are read too. An odd number of lines keeps rows from the same cache sets.
+    lines = nodes // width + 2
+    stride = (lines + 1 - lines % 2) * width
+    offsets = {name: row * stride + width for row, name in enumerate(names)}
+    return Layout(
+        source=_source_digest(), n=n_elements, elements=elements, nodes=nodes, size=stride * len(names), **offsets
+    )
 
 
 def constant_rows(parameters: RodParameters, layout: Layout, dtype: np.dtype) -> Array:
     """The buffer with only the rod's constants filled in: ``(layout.size,)``."""
     constants = rod_constants(parameters)
+    dt = parameters.dt
     rate = constants.rotational_decay_rate
     follows = constants.decay_follows_dilatation
     rows = {
@@ -108,11 +122,14 @@ def constant_rows(parameters: RodParameters, layout: Layout, dtype: np.dtype) ->
         "shear2": constants.shear[2],
         "inertia0": constants.inertia[0],
         "inertia2": constants.inertia[2],
-        "inverse_mass": 1.0 / constants.mass,
+        "step0": dt / constants.inertia[0],
+        "step2": dt / constants.inertia[2],
+        "node_step": dt / constants.mass,
         "bend0": constants.bend[0],
         "bend2": constants.bend[2],
         "voronoi": constants.rest_voronoi_length,
         "inverse_voronoi": 1.0 / constants.rest_voronoi_length,
+        "three": np.full_like(constants.rest_voronoi_length, 3.0),
         "decay0": np.exp(-rate[0]),
         "decay2": np.exp(-rate[2]),
         # A circular cross-section has twice the inertia about its axis, so bending decays at twice this rate.
