@@ -13,10 +13,8 @@ from torch import Tensor
 
 from softgm_bench.rod.contact import (
     contact_forces,
-    contact_nodes,
     element_length,
     element_radius,
-    point_segment_distance,
     shortest_connection,
 )
 from softgm_bench.rod.parameters import RodParameters, rod_constants
@@ -202,15 +200,11 @@ def test_masked_cylinders_are_never_read(seed: int):
     assert torch.equal(forces, forces_of(position, velocity, first(cylinders, 3)))
     forces.sum().backward()
     assert position.grad.isfinite().all()
-    radius = element_radius(position, VOLUME)
-    assert torch.equal(contact_nodes(position, radius, poisoned), contact_nodes(position, radius, first(cylinders, 3)))
 
 
 def test_no_cylinders_mean_no_force():
     position, velocity, cylinders = random_scene(0)
     assert torch.equal(forces_of(position, velocity, first(cylinders, 0)), torch.zeros_like(position))
-    radius = element_radius(position, VOLUME)
-    assert not contact_nodes(position, radius, first(cylinders, 0)).any()
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -245,26 +239,6 @@ def test_gradients_at_rest_are_finite_in_degenerate_places(parameters: RodParame
     assert velocity.grad.isfinite().all()
 
 
-@given(p=point, start=point, end=point)
-def test_point_segment_distance_equals_brute_force(p: tuple, start: tuple, end: tuple):
-    p, start, end = tensor(p), tensor(start), tensor(end)
-    length = (end - start).norm()
-    axis = (end - start) / length if length > 0.0 else tensor([1.0, 0.0, 0.0])
-    actual = point_segment_distance(p, start, axis, length)
-    along = torch.linspace(0.0, 1.0, 2001, dtype=torch.float64)[:, None] * length
-    sampled = (start + along * axis - p).norm(dim=-1).min()
-    assert actual <= sampled + 1e-12
-    assert actual >= sampled - length / 4000.0 - 1e-12
-
-
-def test_point_segment_distance_is_zero_with_zero_gradient_on_the_segment():
-    p = torch.zeros(3, dtype=torch.float64, requires_grad=True)
-    distance = point_segment_distance(p, tensor([0.0, 0.0, -1.0]), tensor([0.0, 0.0, 1.0]), tensor(2.0))
-    distance.backward()
-    assert distance == 0.0
-    assert torch.equal(p.grad, torch.zeros(3, dtype=torch.float64))
-
-
 @settings(max_examples=50, deadline=None)
 @given(seed=SEEDS)
 def test_shortest_connection_of_skew_segments_is_their_minimum_distance(seed: int):
@@ -276,33 +250,6 @@ def test_shortest_connection_of_skew_segments_is_their_minimum_distance(seed: in
     sampled = pairs.norm(dim=0).min()
     assert distance <= sampled + 1e-12
     assert distance >= sampled - (edge1.norm() + edge2.norm()) / 200.0
-
-
-@settings(max_examples=50, deadline=None)
-@given(seed=SEEDS)
-def test_contact_nodes_equal_their_definition(seed: int):
-    position, _, cylinders = random_scene(seed)
-    radius = element_radius(position, VOLUME)
-    touching = contact_nodes(position, radius, cylinders)
-    assert touching.dtype == torch.bool
-    elements = [[0], *([k - 1, k] for k in range(1, 6)), [5]]
-    for k in range(7):
-        node_radius = radius[0, elements[k]].mean()
-        expected = False
-        for c in range(5):
-            values = (cylinders.start[0, c], cylinders.axis[0, c], cylinders.length[0, c])
-            expected |= bool(point_segment_distance(position[0, :, k], *values) < node_radius + cylinders.radius[0, c])
-        assert touching[0, k] == expected
-
-
-def test_contact_nodes_of_known_scene():
-    position = straight_rods(PARAMETERS, 1).position  # nodes every 1/6
-    radius = element_radius(position, VOLUME)
-    across = cylinders_of([[0.079, -0.5, 0.5]], [[0.0, 1.0, 0.0]], [1.0], [0.03])
-    assert contact_nodes(position, radius, across)[0].tolist() == [False, False, False, True, False, False, False]
-    assert not contact_nodes(position, radius, across.replace(radius=across.radius - 0.002)).any()
-    beside = cylinders_of([[0.079, 0.0, 0.4]], [[0.0, 0.0, 1.0]], [0.3], [0.03])
-    assert contact_nodes(position, radius, beside)[0].tolist() == [False, False, False, True, True, False, False]
 
 
 def test_element_length_equals_pyelasticas_including_its_guard():

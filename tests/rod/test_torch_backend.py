@@ -1,13 +1,16 @@
 """What the torch backend promises besides parity: gradients, a clamped base, inactive environments, no side effects."""
 
 import math
+import weakref
 
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
+from softgm_bench.rod.actuation import Actuation
 from softgm_bench.rod.contact import contact_forces, element_radius
 from softgm_bench.rod.parameters import DAMPING_PROTOCOLS, RodParameters, rod_constants
 from softgm_bench.rod.state import Cylinders, RodState, straight_rods
@@ -92,6 +95,132 @@ def test_gradient_through_a_whole_control_step_from_rest_is_finite_and_not_zero(
         (gradient,) = torch.autograd.grad(tip[component], couple, retain_graph=True)
         assert gradient.isfinite().all()
         assert gradient[0, axis].sum() > 0.0
+
+
+@pytest.mark.parametrize("every", [1, 4, 100])
+@pytest.mark.parametrize("model", ["pyelastica", "exact"])
+def test_checkpointed_motion_has_the_same_bits_and_gradients_for_every_input(every: int, model: str):
+    parameters = RodParameters(n_elements=5, contact_model=model, friction_coefficient=0.3, dt=1e-4)
+    state, cylinders, loads = moving_state(), crossing_post(1, 0.06), random_loads(1, seed=1)
+    results = []
+    for backend in (TorchBackend(parameters), TorchBackend(parameters, checkpoint_every=every)):
+        inputs = [getattr(state, name).detach().clone().requires_grad_() for name in FIELDS]
+        inputs += [x.clone().requires_grad_() for x in loads]
+        inputs += [x.clone().requires_grad_() for x in (cylinders.start, cylinders.length, cylinders.radius)]
+        posts = cylinders.replace(start=inputs[-3], length=inputs[-2], radius=inputs[-1])
+        motion = backend.control_step(RodState(*inputs[:4], batch_size=[1]), inputs[4], inputs[5], posts, substeps=10)
+        weights = torch.linspace(-1.0, 2.0, stacked(motion).numel(), dtype=torch.float64)
+        results.append((motion.detach(), torch.autograd.grad((stacked(motion) * weights).sum(), inputs)))
+    (plain, expected), (checkpointed, actual) = results
+    assert_identical(checkpointed, plain)
+    assert expected[-1].abs().max() > 0.0
+    for x, y in zip(actual, expected, strict=True):
+        torch.testing.assert_close(x, y, rtol=1e-11, atol=1e-12 * y.abs().max().item())
+
+
+def test_checkpointed_gradient_needs_only_what_some_input_needs():
+    backend, state, (couple, _) = TorchBackend(PARAMETERS, checkpoint_every=2), moving_state(2), random_loads(2)
+    couple.requires_grad_()
+    after = backend.control_step(state, couple, active=torch.tensor([False, True]))
+    after.omega.sum().backward()
+    assert (couple.grad[0] == 0.0).all()
+    assert (couple.grad[1] != 0.0).any()
+    assert not backend.control_step(state, couple.detach()).position.requires_grad
+
+
+def saved_bytes(every: int | None, substeps: int) -> int:
+    """What a graph over these substeps keeps for its backward pass."""
+    total = 0
+
+    def count(x: Tensor) -> Tensor:
+        nonlocal total
+        total += x.nbytes
+        return x
+
+    couple = random_loads(1)[0].requires_grad_()
+    with torch.autograd.graph.saved_tensors_hooks(count, lambda x: x):
+        TorchBackend(PARAMETERS, every).control_step(straight_rods(PARAMETERS, 1), couple, substeps=substeps)
+    return total
+
+
+def test_checkpointed_graph_keeps_the_inputs_of_each_segment_and_nothing_else():
+    state, (couple, force) = straight_rods(PARAMETERS, 1), random_loads(1)
+    inputs = sum(x.nbytes for x in (*(getattr(state, name) for name in FIELDS), couple, force[0]))
+    assert saved_bytes(10, 20) == 2 * inputs
+    assert saved_bytes(10, 80) == 8 * inputs
+    assert saved_bytes(20, 80) == 4 * inputs
+    assert saved_bytes(None, 80) > 100 * saved_bytes(20, 80)
+
+
+class PeakMemory(TorchDispatchMode):
+    """The largest number of bytes of tensors alive at once, of those made inside."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.peak, self._live, self._known = 0, 0, set()
+
+    def _forget(self, key: int, size: int) -> None:
+        self._live -= size
+        self._known.discard(key)
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        result = function(*args, **(kwargs or {}))
+        for x in result if isinstance(result, tuple | list) else (result,):
+            if isinstance(x, Tensor) and (key := x.untyped_storage()._cdata) not in self._known:
+                storage = x.untyped_storage()
+                self._known.add(key)
+                self._live += storage.nbytes()
+                weakref.finalize(storage, self._forget, key, storage.nbytes())
+        self.peak = max(self.peak, self._live)
+        return result
+
+
+def peak_of_gradient(every: int | None, substeps: int) -> int:
+    """Bytes at the worst moment of the forward and backward pass."""
+    couple = random_loads(1)[0].requires_grad_()
+    with PeakMemory() as memory:
+        after = TorchBackend(PARAMETERS, every).control_step(straight_rods(PARAMETERS, 1), couple, substeps=substeps)
+        after.position.sum().backward()
+    return memory.peak
+
+
+def test_peak_memory_of_a_checkpointed_gradient_grows_by_segments_and_by_the_length_of_one():
+    state = straight_rods(PARAMETERS, 1)
+    one_state = sum(getattr(state, name).nbytes for name in FIELDS)
+    peak = {key: peak_of_gradient(*key) for key in ((None, 20), (None, 80), (10, 20), (10, 80), (20, 80))}
+    a_substep = (peak[None, 80] - peak[None, 20]) / 60.0
+    assert peak[10, 80] - peak[10, 20] < 2 * 6 * one_state  # six more segments
+    assert peak[20, 80] - peak[10, 80] < 11 * a_substep  # ten more substeps a segment
+    assert peak[10, 80] < 0.25 * peak[None, 80]
+
+
+def test_segment_without_substeps_is_refused():
+    with pytest.raises(ValueError, match="checkpoint_every is 0"):
+        TorchBackend(PARAMETERS, checkpoint_every=0)
+
+
+@pytest.mark.parametrize("model", ["pyelastica", "exact"])
+def test_gradient_through_a_sequence_of_actions_and_a_contact_equals_a_finite_difference(model: str):
+    parameters = RodParameters(n_elements=8, substeps=30, contact_model=model)
+    backend, actuation = TorchBackend(parameters, checkpoint_every=10), Actuation(parameters, 3, 25.0)
+    post = crossing_post(1, 0.098)  # pressed by 2 mm at rest
+    generator = torch.Generator().manual_seed(3)
+    actions = torch.rand(4, 1, 3, 2, dtype=torch.float64, generator=generator)
+
+    def final(actions: Tensor, cylinders: Cylinders | None = post) -> RodState:
+        state = straight_rods(parameters, 1)
+        for action in actions:
+            state = backend.control_step(state, actuation.couple(action), cylinders=cylinders)
+        return state
+
+    actions.requires_grad_()
+    reached = final(actions)
+    assert not torch.equal(reached.position, final(actions.detach(), None).position)
+    (gradient,) = torch.autograd.grad(reached.position[0, :, -1].sum(), actions)
+    direction = torch.randn(actions.shape, dtype=torch.float64, generator=generator)
+    ahead, behind = (final(actions.detach() + sign * 1e-6 * direction) for sign in (1.0, -1.0))
+    difference = (ahead.position[0, :, -1] - behind.position[0, :, -1]).sum().item() / 2e-6
+    assert (gradient * direction).sum().item() == pytest.approx(difference, rel=1e-5)
 
 
 @pytest.mark.parametrize("with_post", [False, True])

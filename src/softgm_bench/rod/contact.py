@@ -1,4 +1,4 @@
-"""Contact between rods and fixed cylinders: PyElastica's penalty forces, and the geometric test of who touches.
+"""Contact between rods and fixed cylinders: PyElastica's penalty forces.
 
 Vectors over elements keep PyElastica's layout, components before elements. A pair (cylinder, element) adds one
 dimension in front: ``(num_envs, n_cylinders, 3, n_elements)``. There are no matrix products, whose rounding depends on
@@ -74,64 +74,8 @@ def contact_forces(
     penetration = radius[:, None] + cylinder_radius - distance
     touching = cylinders.mask[:, :, None] & (penetration > 0.0)
     force = _pair_forces(gap, distance, penetration, approach, touching, parameters)
-    return -_elements_to_nodes(force.sum(1))
-
-
-def contact_nodes(position: Tensor, radius: Tensor, cylinders: Cylinders) -> Tensor:
-    """Which nodes touch a cylinder: geometric, independent of the force model.
-
-    A node touches where its distance to the axis segment of an existing cylinder is below the sum of the radii. A
-    node's radius is the mean of its elements'.
-
-    Args:
-        position: ``(num_envs, 3, n_nodes)``.
-        radius: current radii of the elements, ``(num_envs, n_elements)``.
-        cylinders: of the same ``num_envs``.
-
-    Returns:
-        bool, ``(num_envs, n_nodes)``.
-    """
-    node_radius = 0.5 * (
-        torch.cat([radius[:, :1], radius], dim=-1) + torch.cat([radius, radius[:, -1:]], dim=-1)
-    )  # (num_envs, n_nodes); the end nodes count their one element twice
-    env, cylinder = _boxes_overlap(position, node_radius, cylinders).nonzero(as_tuple=True)
-    distance = point_segment_distance(
-        position[env].transpose(-1, -2),
-        cylinders.start[env, cylinder].unsqueeze(1),
-        cylinders.axis[env, cylinder].unsqueeze(1),
-        cylinders.length[env, cylinder].unsqueeze(1),
-    )
-    touches = distance < node_radius[env] + cylinders.radius[env, cylinder].unsqueeze(1)  # (pairs, n_nodes)
-    count = torch.zeros(node_radius.shape, dtype=torch.int32, device=position.device)
-    return count.index_add_(0, env, touches.to(torch.int32)) > 0
-
-
-def _boxes_overlap(position: Tensor, node_radius: Tensor, cylinders: Cylinders) -> Tensor:
-    """Pairs of rod and existing cylinder that may touch, ``(num_envs, n_cylinders)``: their bounding boxes meet."""
-    thickness = node_radius.amax(dim=-1, keepdim=True)
-    rod_low, rod_high = position.amin(dim=-1) - thickness, position.amax(dim=-1) + thickness
-    end = cylinders.start + cylinders.axis * cylinders.length.unsqueeze(-1)
-    low = torch.minimum(cylinders.start, end) - cylinders.radius.unsqueeze(-1)
-    high = torch.maximum(cylinders.start, end) + cylinders.radius.unsqueeze(-1)
-    apart = (low > rod_high.unsqueeze(1)) | (high < rod_low.unsqueeze(1))
-    return cylinders.mask & ~apart.any(dim=-1)
-
-
-def point_segment_distance(point: Tensor, start: Tensor, axis: Tensor, length: Tensor) -> Tensor:
-    """Distance of points to segments.
-
-    Args:
-        point: ``(..., 3)``.
-        start: one end of the segment, ``(..., 3)``, broadcast with ``point``.
-        axis: unit vector to the other end, ``(..., 3)``.
-        length: ``(...)``.
-
-    Returns:
-        ``(...)``, the broadcast of all.
-    """
-    offset = point - start
-    along = torch.minimum((offset * axis).sum(-1).clamp(min=0.0), length)
-    return safe_norm(offset - along[..., None] * axis, dim=-1)
+    # One after the other, so that a masked cylinder's zeros change no bit; sum() may group them.
+    return -_elements_to_nodes(force.cumsum(1)[:, -1])
 
 
 def shortest_connection(start1: Tensor, edge1: Tensor, start2: Tensor, edge2: Tensor) -> Tensor:

@@ -1,5 +1,7 @@
 """What moves (the rod's state) and what it may touch (cylinders), batched over environments."""
 
+from functools import lru_cache
+
 import torch
 from tensordict import TensorClass
 from torch import Tensor
@@ -48,13 +50,9 @@ def straight_rods(
     device: torch.device | str = "cpu",
 ) -> RodState:
     """Rods at rest: straight along +z from the origin with d1 = +y."""
-    constants = rod_constants(parameters)
-
-    def repeat(array) -> Tensor:
-        tensor = torch.as_tensor(array, dtype=dtype, device=device)
-        return tensor.expand(num_envs, *tensor.shape).clone()
-
-    position, director = repeat(constants.position), repeat(constants.director)
+    position, director = (
+        one.expand(num_envs, *one.shape).clone() for one in _straight(parameters, dtype, torch.device(device))
+    )
     return RodState(
         position=position,
         director=director,
@@ -62,6 +60,14 @@ def straight_rods(
         omega=torch.zeros_like(director[:, 0]),
         batch_size=[num_envs],
     )
+
+
+@lru_cache(maxsize=8)
+def _straight(parameters: RodParameters, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Nodes and directors of one straight rod, copied to the device once."""
+    constants = rod_constants(parameters)
+    position = torch.as_tensor(constants.position, dtype=dtype, device=device)
+    return position, torch.as_tensor(constants.director, dtype=dtype, device=device)
 
 
 def dilatation(position: Tensor, rest_length: Tensor) -> Tensor:

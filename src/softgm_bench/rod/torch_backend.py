@@ -6,16 +6,22 @@ on its neighbours.
 """
 
 import math
+from collections.abc import Callable
+from functools import partial
 from types import SimpleNamespace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from softgm_bench.rod.contact import contact_forces, element_length, element_radius
+from softgm_bench.rod.exact_contact import exact_contact_forces
 from softgm_bench.rod.parameters import RodParameters, rod_constants
 from softgm_bench.rod.state import Cylinders, RodState, check_inputs
+
+_CONTACT_FORCES = {"pyelastica": contact_forces, "exact": exact_contact_forces}
 
 # Taylor coefficients, enough for float64's round-off below _SERIES_BELOW (a squared angle).
 _SERIES_BELOW = 0.09
@@ -52,11 +58,22 @@ class TorchBackend:
 
     Attributes:
         parameters: of every rod.
+        checkpoint_every: substeps in a segment whose intermediate values are computed again in the backward pass.
     """
 
-    def __init__(self, parameters: RodParameters) -> None:
-        """Hold the parameters; tensors are made at the first step on a device."""
+    def __init__(self, parameters: RodParameters, checkpoint_every: int | None = None) -> None:
+        """Hold the parameters; tensors are made at the first step on a device.
+
+        With ``checkpoint_every``, a graph for gradients keeps one state per segment and the backward pass the
+        intermediate values of one segment at a time; without, it keeps those of every substep. Gradients are the same.
+
+        Raises:
+            ValueError: if a segment would have no substeps.
+        """
+        if checkpoint_every is not None and checkpoint_every < 1:
+            raise ValueError(f"checkpoint_every is {checkpoint_every}: a segment needs at least 1 substep")
         self.parameters = parameters
+        self.checkpoint_every = checkpoint_every
         self._constants = rod_constants(parameters)
         self._tensors: dict[tuple[torch.dtype, torch.device], SimpleNamespace] = {}
 
@@ -108,8 +125,21 @@ class TorchBackend:
         """``control_step`` on plain tensors, every environment moving."""
         constants = self._constants_like(motion.position)
         external_force = constants.weight if force is None else constants.weight + force
-        for _ in range(self.parameters.substeps if substeps is None else substeps):
-            motion = self._substep(motion, constants, couple, external_force, cylinders)
+
+        def segment(count: int, motion: Motion, couple: Tensor, force: Tensor, cylinders: Cylinders | None) -> Motion:
+            for _ in range(count):
+                motion = self._substep(motion, constants, couple, force, cylinders)
+            return motion
+
+        substeps = self.parameters.substeps if substeps is None else substeps
+        if self.checkpoint_every is None or not torch.is_grad_enabled():
+            motion = segment(substeps, motion, couple, external_force, cylinders)
+        else:
+            for begun in range(0, substeps, self.checkpoint_every):
+                count = min(self.checkpoint_every, substeps - begun)
+                motion = _recomputed(partial(segment, count), motion, couple, external_force, cylinders)
+        if motion.director.dtype == torch.float32:
+            motion = motion._replace(director=straightened(motion.director))
         return motion
 
     def _substep(
@@ -129,7 +159,8 @@ class TorchBackend:
         force = internal_forces(motion.director, stress, now) + external_force
         if cylinders is not None:
             radius = element_radius(motion.position, constants.volume)
-            force = force + contact_forces(motion.position, motion.velocity, radius, cylinders, self.parameters)
+            contact = _CONTACT_FORCES[self.parameters.contact_model]
+            force = force + contact(motion.position, motion.velocity, radius, cylinders, self.parameters)
         torque = internal_torques(motion, stress, now, constants) + couple
 
         motion = dynamic_step(motion, force, torque, now.dilatation, constants, dt)
@@ -149,6 +180,51 @@ class TorchBackend:
         return self._tensors[key]
 
 
+class _Recomputed(torch.autograd.Function):
+    """A function of tensors whose intermediate values are computed again in the backward pass rather than kept.
+
+    ``torch.utils.checkpoint`` does the same through hooks on every saved tensor, which for a rod of this size cost
+    more than the arithmetic.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, run: Callable[..., tuple[Tensor, ...]], *inputs: Tensor) -> tuple[Tensor, ...]:
+        ctx.run = run
+        ctx.save_for_backward(*inputs)
+        return tuple(run(*inputs))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        needed = ctx.needs_input_grad[1:]
+        inputs = [x.detach().requires_grad_(need) for x, need in zip(ctx.saved_tensors, needed, strict=True)]
+        with torch.enable_grad():
+            outputs = ctx.run(*inputs)
+        used = [(output, gradient) for output, gradient in zip(outputs, gradients, strict=True) if output.requires_grad]
+        wanted = [x for x in inputs if x.requires_grad]
+        found = iter(
+            torch.autograd.grad(
+                [output for output, _ in used], wanted, [gradient for _, gradient in used], allow_unused=True
+            )
+        )
+        return (None, *(next(found) if need else None for need in needed))
+
+
+def _recomputed(
+    segment: Callable[..., Motion], motion: Motion, couple: Tensor, force: Tensor, cylinders: Cylinders | None
+) -> Motion:
+    """``segment`` of the other arguments with gradients for each of them, through ``_Recomputed``."""
+    shapes = () if cylinders is None else (cylinders.start, cylinders.axis, cylinders.length, cylinders.radius)
+
+    def run(*inputs: Tensor) -> Motion:
+        obstacles = None
+        if cylinders is not None:
+            obstacles = Cylinders(*inputs[6:], mask=cylinders.mask, batch_size=cylinders.batch_size)
+        return segment(Motion(*inputs[:4]), inputs[4], inputs[5], obstacles)
+
+    return Motion(*_Recomputed.apply(run, *motion, couple, force, *shapes))
+
+
 def kinematic_step(motion: Motion, duration: float) -> Motion:
     """Move nodes and turn directors with constant rates (PyElastica's ``overload_operator_kinematic_numba``).
 
@@ -161,6 +237,16 @@ def kinematic_step(motion: Motion, duration: float) -> Motion:
     turned = torch.linalg.cross(motion.director, angle, dim=1)
     director = motion.director + sine * turned + cosine * torch.linalg.cross(turned, angle, dim=1)
     return motion._replace(position=motion.position + duration * motion.velocity, director=director)
+
+
+def straightened(director: Tensor) -> Tensor:
+    """Directors orthonormal to round-off again: one Newton step ``(3 - Q Q^T) Q / 2`` towards the nearest rotation.
+
+    PyElastica leaves directors to themselves. In float64 they stay within 1e-13; in float32 what they lose in each of
+    thousands of steps adds up, and the arm drifts with it.
+    """
+    gram = (director[:, :, None] * director[:, None]).sum(3)  # (num_envs, 3, 3, n_elements)
+    return 1.5 * director - 0.5 * (gram[:, :, :, None] * director[:, None]).sum(2)
 
 
 def dynamic_step(
