@@ -18,6 +18,8 @@ from omegaconf.errors import OmegaConfBaseException
 
 from softgm_bench.rod.parameters import RodParameters
 
+DTYPES = ("float64", "float32")
+
 
 class UserError(Exception):
     """Something that the user can put right; the message is one line that says what, where and how."""
@@ -64,7 +66,8 @@ class Config:
 
     seed: int
     device: str
-    backend: str
+    backend: str | None
+    dtype: str
     threads: int | None
     run_dir: str
     overwrite: bool
@@ -167,6 +170,13 @@ def validate(config: Config) -> None:
     _validate_by_building(config)
 
 
+def dtype_of(config: Config) -> Any:
+    """The ``torch.dtype`` of the rod's state; torch is imported late because that takes seconds."""
+    import torch
+
+    return getattr(torch, config.dtype)
+
+
 def available_threads() -> int:
     """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -180,26 +190,42 @@ def _validate_machine(config: Config) -> None:
     cores = available_threads()
     if config.threads is not None and not 1 <= config.threads <= cores:
         raise UserError(f"threads={config.threads}: choose 1 to {cores}, the cores of this machine, or null")
-    if config.backend not in BACKENDS:
-        raise UserError(f"backend={config.backend}: choose one of {', '.join(BACKENDS)}")
+    if config.backend is not None and config.backend not in BACKENDS:
+        raise UserError(f"backend={config.backend}: choose one of {', '.join(BACKENDS)}, or null")
+    if config.dtype not in DTYPES:
+        raise UserError(f"dtype={config.dtype}: choose one of {', '.join(DTYPES)}")
     device = re.fullmatch(r"cpu|cuda(?::(\d+))?", config.device)
     if device is None:
         raise UserError(f"device={config.device}: choose cpu, cuda or cuda:<index>")
     if config.device == "cpu":
+        if config.backend == "cuda":
+            raise UserError("backend=cuda runs on a CUDA device: add device=cuda, or choose backend=numba")
         return
     if config.backend == "numba":
-        raise UserError(f"device={config.device}: backend=numba runs on the CPU; add backend=torch")
+        raise UserError(f"device={config.device}: backend=numba runs on the CPU; choose backend=cuda, torch or null")
     if int(device.group(1) or 0) >= torch.cuda.device_count():
         raise UserError(f"device={config.device}: this machine has {torch.cuda.device_count()} CUDA devices")
 
 
 def _validate_by_building(config: Config) -> None:
     """Draw one scene and build one network: what only they can refuse is refused before anything is written."""
+    import torch
+
     from softgm_bench.envs import make_env
+    from softgm_bench.envs.tasks import make_task
     from softgm_bench.models.registry import build_encoder
 
     try:
-        env = make_env(config.task, config.rod, 1, config.seed, device=config.device, backend=config.backend)
+        make_task(config.task).sample(1, torch.Generator())  # on the CPU, where ranges that leave nothing show
+        env = make_env(
+            config.task,
+            config.rod,
+            1,
+            config.seed,
+            device=config.device,
+            backend=config.backend,
+            dtype=dtype_of(config),
+        )
         build_encoder(config.model, env.n_agents, env.n_slots)
     except ValueError as error:
         raise UserError(str(error)) from error

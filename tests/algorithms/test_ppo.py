@@ -4,6 +4,7 @@ from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs.utils import ExplorationType
 
+from round_trips import RoundTrips
 from softgm_bench.algorithms.ppo import ADVANTAGE, PPO, VALUE_TARGET
 from softgm_bench.envs import keys, make_env
 from softgm_bench.rod.parameters import RodParameters
@@ -147,3 +148,31 @@ def test_clipped_advantages_are_standardised_again_only_if_they_were_before(buil
     advantage = standardised[0].prepare(collect(*standardised))[ADVANTAGE][:, 0]
     assert advantage.mean().abs() < 1e-5
     assert advantage.std() == pytest.approx(1.0, abs=1e-4)
+
+
+@pytest.mark.parametrize("model", ["mlp", "softgm"])
+def test_an_update_itself_never_waits_for_a_device_before_all_minibatches_are_done(build, model):
+    """What waits lies in libraries and in SoftGM's packing of edges, see docs/environment.md."""
+    algorithm, env = build("basic", f"model={model}")
+    algorithm.update(collect(algorithm, env))
+    optimizers = (algorithm.actor_optimizer, algorithm.critic_optimizer)
+    steps = tuple(state["step"] for optimizer in optimizers for state in optimizer.state.values())  # on the CPU
+    batch = collect(algorithm, env)
+    with RoundTrips(exempt=steps) as trips:
+        algorithm.update(batch)
+    assert {found.split(" ")[2].split(":")[0] for found in trips.found} <= {
+        "continuous.py",
+        "advantages.py",
+        "graph.py",
+    }
+
+
+def test_reported_losses_are_the_means_over_the_minibatches_of_each_epoch_and_over_epochs(build):
+    algorithm, env = build("basic", "algo.entropy_coeff=0.0")
+    seen = []
+    step = algorithm._step
+    algorithm._step = lambda minibatch: seen.append(step(minibatch)) or seen[-1]
+    reported = algorithm.update(collect(algorithm, env))
+    assert len(seen) == 4  # two epochs of two minibatches
+    for name in ("loss_objective", "loss_critic", "kl_approx", "actor_grad_norm"):
+        assert reported[name] == pytest.approx(sum(float(metrics[name]) for metrics in seen) / 4, rel=1e-6, abs=1e-9)

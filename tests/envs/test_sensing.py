@@ -2,7 +2,7 @@ import pytest
 import torch
 from hypothesis import given, settings, strategies
 
-from softgm_bench.envs.sensing import cut_into_bins, discover, empty_table, observe_slots, sense
+from softgm_bench.envs.sensing import cut_into_bins, discover, empty_table, look, look_dense, observe_slots, sense
 from softgm_bench.rod.state import Cylinders
 
 
@@ -133,3 +133,72 @@ def test_scenes_without_obstacles_have_empty_slots(n_slots):
     assert sensed.shape == (2, 6, 0)
     assert new.tolist() == [0, 0]
     assert table.bin_of_slot.shape == (2, n_slots)
+
+
+def random_scene(seed: int, num_envs: int, dtype: torch.dtype) -> Cylinders:
+    """Cylinders of any direction and length up to 1 m, some masked."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def uniform(*shape, low=0.0, high=1.0):
+        return low + (high - low) * torch.rand(shape, generator=generator, dtype=torch.float64)
+
+    axis = uniform(num_envs, 4, 3, low=-1.0)
+    return Cylinders(
+        start=uniform(num_envs, 4, 3, low=-0.5, high=0.5).to(dtype),
+        axis=(axis / axis.norm(dim=-1, keepdim=True)).to(dtype),
+        length=uniform(num_envs, 4, low=0.01).to(dtype),
+        radius=uniform(num_envs, 4, low=0.01, high=0.1).to(dtype),
+        mask=uniform(num_envs, 4) < 0.8,
+        batch_size=[num_envs],
+    )
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("n_slots", [0, 5, 64])
+@pytest.mark.parametrize("radius", [0.05, 0.15, 0.6])
+def test_the_compiled_look_equals_the_dense_one_bit_by_bit(dtype, n_slots, radius):
+    cylinders = random_scene(1, 50, dtype)
+    bins = cut_into_bins(cylinders, 0.05, 1.0)
+    generator = torch.Generator().manual_seed(2)
+    compiled = dense = empty_table(50, n_slots, bins.mask.shape[1], torch.device("cpu"))
+    sensed = 0
+    for _ in range(12):
+        agents = (torch.rand(50, 3, 3, generator=generator, dtype=torch.float64) - 0.5).to(dtype)
+        found = look(agents, cylinders, bins, compiled, radius, 0.05)
+        expected = look_dense(agents, bins, dense, radius)
+        for name in ("new", "descriptor", "active", "edge"):
+            assert torch.equal(getattr(found, name), getattr(expected, name)), name
+            assert getattr(found, name).dtype == getattr(expected, name).dtype
+        for name in ("bin_of_slot", "known", "count", "dropped"):
+            assert torch.equal(getattr(found.table, name), getattr(expected.table, name)), name
+        compiled, dense = found.table, expected.table
+        sensed += int(sense(agents, bins, radius).sum())
+    assert sensed > 100
+    assert (compiled.dropped.sum() > 0) == (n_slots < 64)
+
+
+def test_a_look_misses_no_bin_that_lies_just_within_reach():
+    """Agents on spheres about the bins' centres, a hair inside and outside."""
+    cylinders = random_scene(3, 200, torch.float64)
+    bins = cut_into_bins(cylinders, 0.05, 1.0)
+    generator = torch.Generator().manual_seed(4)
+    direction = torch.randn(200, 1, 3, generator=generator, dtype=torch.float64)
+    direction /= direction.norm(dim=-1, keepdim=True)
+    table = empty_table(200, 100, bins.mask.shape[1], torch.device("cpu"))
+    for index in torch.randint(bins.mask.shape[1], (30,), generator=generator):
+        reach = (bins.descriptor[:, index, 6] + 0.15).view(-1, 1, 1)
+        for hair, expected in ((-1e-12, bins.mask[:, index]), (1e-12, torch.zeros(200, dtype=torch.bool))):
+            agents = bins.descriptor[:, index, None, :3] + (reach + hair) * direction
+            known = look(agents, cylinders, bins, table, 0.15, 0.05).table.known[:, index]
+            assert torch.equal(known, expected)
+
+
+def test_a_look_leaves_the_table_that_it_was_given_alone():
+    cylinders = random_scene(5, 10, torch.float64)
+    bins = cut_into_bins(cylinders, 0.05, 1.0)
+    table = empty_table(10, 8, bins.mask.shape[1], torch.device("cpu"))
+    found = look(cylinders.start[:, :1], cylinders, bins, table, 0.15, 0.05)
+    assert found.table.count.sum() > 0
+    assert (table.bin_of_slot == -1).all()
+    assert not table.known.any()
+    assert table.count.sum() == table.dropped.sum() == 0

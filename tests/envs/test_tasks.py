@@ -5,6 +5,8 @@ import pytest
 import torch
 
 from softgm_bench.envs.tasks import make_task
+from softgm_bench.envs.tasks.base import first_accepted
+from softgm_bench.rod.dense import force_dense
 
 COUNT = 500
 
@@ -107,3 +109,27 @@ def test_ranges_that_leave_nothing_are_refused(settings):
         make_task(dataclasses.replace(config, max_path=0.1)).sample(3, torch.Generator())
     with pytest.raises(ValueError, match=r"task.opening_z"):
         make_task(dataclasses.replace(config, opening_side=2.0))
+
+
+@pytest.mark.parametrize("name", ["basic", "wall"])
+def test_scenes_drawn_without_a_look_at_values_are_admissible_and_as_varied(draw, name):
+    config, task, scene = draw(name)
+    with force_dense():
+        blind = task.sample(COUNT, torch.Generator().manual_seed(0))
+        again = task.sample(COUNT, torch.Generator().manual_seed(0))
+    assert torch.equal(blind.target, again.target)
+    assert len(blind.target.unique(dim=0)) == COUNT
+    # two samples of one distribution: means differ by a few standard errors at most
+    error = scene.target.std(dim=0) / COUNT**0.5
+    assert ((blind.target.mean(dim=0) - scene.target.mean(dim=0)).abs() < 6.0 * error).all()
+    if name == "basic":
+        tip = torch.tensor(config.resting_tip, dtype=torch.float64)
+        assert ((blind.target - tip).norm(dim=-1) >= config.min_distance_to_resting_tip).all()
+
+
+def test_rejection_without_a_look_keeps_the_order_of_what_is_accepted():
+    values = torch.arange(5000.0)
+    found = first_accepted(lambda n: values[:n], lambda x: x % 7 == 3, 6)
+    assert found.tolist() == [3.0, 10.0, 17.0, 24.0, 31.0, 38.0]
+    # two accepted values for five rows are shared
+    assert first_accepted(lambda n: values[:n], lambda x: (x == 5) | (x == 9), 5).tolist() == [5.0, 9.0, 5.0, 9.0, 5.0]

@@ -1,14 +1,17 @@
 import dataclasses
 
 import pytest
+import torch
 import yaml
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from softgm_bench.config import UserError, compose, compose_untyped, config_directory, plain, typed
+from softgm_bench.config import UserError, compose, compose_untyped, config_directory, dtype_of, plain, typed
+from softgm_bench.envs import make_env
 from softgm_bench.envs.tasks import TASK_CONFIGS
 from softgm_bench.experiment.explain import USER_ERRORS, explain
+from softgm_bench.rod.numba_backend import NumbaBackend
 from softgm_bench.rod.parameters import RodParameters
 
 
@@ -93,6 +96,7 @@ def test_unknown_choices_list_the_known_ones():
         "device=gpu",
         "device=cuda",
         "backend=jax",
+        "dtype=float16",
         "run_dir=''",
         "experiment.total_frames=0",
         "experiment.num_envs=-2",
@@ -129,6 +133,22 @@ def test_values_without_sense_are_refused_by_name(override):
 
     assert str(caught.value).startswith(key)
     assert value.strip("'") in str(caught.value)
+
+
+def test_a_backend_and_a_device_that_do_not_fit_are_refused_in_one_line():
+    assert "backend=numba" in refusal("device=cuda", "backend=numba")
+    assert "choose backend=cuda" in refusal("device=cuda", "backend=numba")
+    assert "device=cuda" in refusal("backend=cuda")
+
+
+def test_the_backend_is_the_devices_fused_kernel_unless_one_is_named_and_the_precision_is_the_rods():
+    config = compose(["dtype=float32"])
+    assert config.backend is None
+    env = make_env(config.task, config.rod, 1, 0, dtype=dtype_of(config))
+    assert isinstance(env.backend, NumbaBackend)
+    assert env.simulation_state()["rod", "position"].dtype == torch.float32
+    assert env.reset()["tip"].dtype == torch.float32
+    assert dtype_of(compose([])) == torch.float64
 
 
 def test_what_only_building_the_environment_or_the_model_can_refuse_is_refused_with_the_rest():

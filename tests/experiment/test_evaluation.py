@@ -8,6 +8,7 @@ from torchrl.envs.utils import exploration_type
 from softgm_bench.envs import keys
 from softgm_bench.experiment.evaluation import evaluate
 from softgm_bench.experiment.summary import summarise, wilson_interval
+from softgm_bench.rod.dense import force_dense
 
 
 def policy(seen=None):
@@ -46,6 +47,16 @@ def test_ended_environments_cost_no_policy_evaluation_and_the_last_one_ends_the_
     evaluate(policy(seen), CountingEnv([3, 1, 2]), deterministic=True, seed=0)
 
     assert [count for count, _, _ in seen] == [3, 2, 1]
+
+
+def test_looking_only_now_and_then_whether_episodes_go_on_changes_no_record():
+    def records():
+        act = TensorDictModule(lambda tip: torch.ones(*tip.shape[:-1], N_AGENTS, 2), [keys.TIP], [keys.ACTION])
+        return evaluate(act, CountingEnv([3, 1, 20]), deterministic=True, seed=0).rows()
+
+    expected = records()
+    with force_dense():
+        assert records() == expected
 
 
 @pytest.mark.parametrize(("deterministic", "expected"), [(True, "DETERMINISTIC"), (False, "RANDOM")])

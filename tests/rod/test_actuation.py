@@ -61,3 +61,11 @@ def test_an_element_receives_the_couple_per_length_times_its_length():
 def test_settings_that_mean_nothing_are_refused_in_one_line(arguments, message):
     with pytest.raises(ValueError, match=message):
         Actuation(ARM, **{"n_agents": 6, "max_torque": 25.0} | arguments)
+
+
+def test_couple_of_an_environment_has_the_same_bits_in_any_batch():
+    actuation = Actuation(RodParameters(), 6, max_torque=25.0)
+    action = torch.rand(300, 6, 2, generator=torch.Generator().manual_seed(0)) * 2.0 - 1.0
+    together = actuation.couple(action)
+    for size in (1, 7, 64):
+        assert torch.equal(actuation.couple(action[:size]), together[:size])

@@ -105,10 +105,17 @@ class PPO:
             Means over all minibatches of losses, entropy, KL divergence, clip fraction and gradient norms.
         """
         frames = self.prepare(batch)
-        epochs = [self._epoch(frames) for _ in range(self.config.epochs)]
+        totals, counts = zip(*(self._epoch(frames) for _ in range(self.config.epochs)), strict=True)
+        names = list(totals[0])
+        # the only look at results: a GPU works through all minibatches without being waited for
+        read = torch.stack([torch.stack([total[name] for name in names]) for total in totals]).tolist()
+        epochs = [
+            {name: value / count for name, value in zip(names, values, strict=True)}
+            for values, count in zip(read, counts, strict=True)
+        ]
         if self.config.target_kl is not None:
             self._adapt_actor_lr(epochs[-1]["kl_approx"], self.config.target_kl)
-        means = {name: sum(epoch[name] for epoch in epochs) / len(epochs) for name in epochs[0]}
+        means = {name: sum(epoch[name] for epoch in epochs) / len(epochs) for name in names}
         return means | {"actor_lr": self.actor_optimizer.param_groups[0]["lr"]}
 
     def prepare(self, batch: TensorDictBase) -> TensorDictBase:
@@ -131,8 +138,8 @@ class PPO:
         n_agents = frames.get(keys.LOG_PROB).shape[-1]
         return frames.set(ADVANTAGE, advantage.unsqueeze(-2).expand(-1, n_agents, 1))
 
-    def _epoch(self, frames: TensorDictBase) -> dict[str, float]:
-        """Pass once over all frames in random minibatches; means over the minibatches."""
+    def _epoch(self, frames: TensorDictBase) -> tuple[dict[str, Tensor], int]:
+        """Pass once over all frames in random minibatches; sums over the minibatches, and how many there were."""
         totals: dict[str, Tensor] = {}
         count, size = 0, self.config.minibatch_size
         for chosen in torch.randperm(len(frames), device=frames.device).split(size):
@@ -141,7 +148,7 @@ class PPO:
                 for name, value in self._step(frames[chosen]).items():
                     totals[name] = totals.get(name, torch.zeros_like(value)) + value
                 count += 1
-        return {name: float(total) / count for name, total in totals.items()}
+        return totals, count
 
     def _adapt_actor_lr(self, kl: float, target: float) -> None:
         """Keep the policy's change per update near ``target``, the mean KL divergence over the last epoch.

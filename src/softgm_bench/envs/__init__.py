@@ -15,12 +15,16 @@ def make_env(
     seed: int,
     horizon: int | None = None,
     device: torch.device | str = "cpu",
-    backend: str = "numba",
+    backend: str | None = None,
     dtype: torch.dtype = torch.float64,
     stagger: bool = False,
 ) -> SoftArmEnv:
-    """Build ``num_envs`` environments of one task; see ``SoftArmEnv`` for the arguments."""
-    rod = make_backend(backend, rod_parameters)
+    """Build ``num_envs`` environments of one task; see ``SoftArmEnv`` for the arguments.
+
+    ``backend`` is a name that ``make_backend`` knows; None: the fused kernel of the device.
+    """
+    fused = "numba" if torch.device(device).type == "cpu" else "cuda"
+    rod = make_backend(backend or fused, rod_parameters)
     return SoftArmEnv(make_task(task_config), rod, num_envs, seed, horizon, device, dtype, stagger)
 
 

@@ -4,11 +4,14 @@ Paper, section "Graph Construction". Everything is batched over environments; a 
 """
 
 import math
+from typing import NamedTuple
 
 import torch
 from tensordict import TensorClass
 from torch import Tensor
 
+from softgm_bench.envs import sensing_kernel
+from softgm_bench.rod.dense import arrays, dense
 from softgm_bench.rod.state import Cylinders
 
 
@@ -39,6 +42,24 @@ class SlotTable(TensorClass):
     known: Tensor
     count: Tensor
     dropped: Tensor
+
+
+class Sight(NamedTuple):
+    """What the agents of ``num_envs`` environments see, after a look around.
+
+    Attributes:
+        table: with what has just been discovered.
+        new: bins that were stored by this look, ``(num_envs,)`` int64.
+        descriptor: of the slots, zero for PAD, ``(num_envs, n_slots, 9)`` float32.
+        active: slots that hold a bin, ``(num_envs, n_slots)`` bool.
+        edge: agent senses the slot's bin now, ``(num_envs, n_agents, n_slots)`` bool.
+    """
+
+    table: SlotTable
+    new: Tensor
+    descriptor: Tensor
+    active: Tensor
+    edge: Tensor
 
 
 def bins_per_cylinder(max_length: float, bin_length: float) -> int:
@@ -85,6 +106,55 @@ def empty_table(num_envs: int, n_slots: int, n_bins: int, device: torch.device) 
     )
 
 
+def look(
+    agent_position: Tensor,
+    cylinders: Cylinders,
+    bins: Bins,
+    table: SlotTable,
+    sensing_radius: float,
+    bin_length: float,
+) -> Sight:
+    """Sense, discover, observe: a compiled loop on the CPU, ``look_dense`` elsewhere.
+
+    Args:
+        agent_position: m, ``(num_envs, n_agents, 3)``.
+        cylinders: what was cut into ``bins``.
+        bins: of the same environments, ``cut_into_bins(cylinders, bin_length, ...)``.
+        table: not changed.
+        sensing_radius: rho, m.
+        bin_length: m.
+
+    Returns:
+        What the agents see; equal, bit by bit, to ``look_dense``.
+    """
+    if dense(agent_position.device):
+        return look_dense(agent_position, bins, table, sensing_radius)
+    num_envs, n_agents = agent_position.shape[:2]
+    n_slots = table.bin_of_slot.shape[1]
+    descriptor = torch.zeros((num_envs, n_slots, 9))
+    active = torch.zeros((num_envs, n_slots), dtype=torch.bool)
+    edge = torch.zeros((num_envs, n_agents, n_slots), dtype=torch.bool)
+    if not bins.mask.shape[1]:
+        return Sight(table, torch.zeros_like(table.count), descriptor, active, edge)
+    updated = [value.clone() for value in (table.bin_of_slot, table.known, table.count, table.dropped)]
+    new = torch.empty_like(table.count)
+    scene = (cylinders.start, cylinders.axis, cylinders.length, cylinders.radius, cylinders.mask)
+    read = arrays(agent_position, *scene, bins.descriptor, bins.mask)
+    real = read[0].dtype.type
+    written = arrays(*updated, new, descriptor, active, edge)
+    arguments = [*read, real(sensing_radius), real(bin_length), *written]
+    sensing_kernel.look(*arguments)
+    return Sight(SlotTable(*updated, batch_size=table.batch_size), new, descriptor, active, edge)
+
+
+def look_dense(agent_position: Tensor, bins: Bins, table: SlotTable, sensing_radius: float) -> Sight:
+    """``look`` by testing every agent against every bin."""
+    sensed = sense(agent_position, bins, sensing_radius)
+    table, new = discover(table, sensed)
+    descriptor, active, edge = observe_slots(table, bins, sensed)
+    return Sight(table, new, descriptor.to(torch.float32), active, edge)
+
+
 def sense(agent_position: Tensor, bins: Bins, sensing_radius: float) -> Tensor:
     """Which agent senses which bin: ``||p_i - c_k|| - r_k < rho``.
 
@@ -111,17 +181,17 @@ def discover(table: SlotTable, sensed: Tensor) -> tuple[SlotTable, Tensor]:
         The table after this step, and the number of bins stored by it, ``(num_envs,)`` int64.
     """
     new = sensed.any(dim=1) & ~table.known
-    if not bool(new.any()):
-        return table, torch.zeros_like(table.count)
     slot = table.count.unsqueeze(-1) + new.cumsum(dim=-1) - 1
-    stored = new & (slot < table.bin_of_slot.shape[1])
-    env, index = stored.nonzero(as_tuple=True)
-    bin_of_slot = table.bin_of_slot.clone()
-    bin_of_slot[env, slot[env, index]] = index
+    n_slots = table.bin_of_slot.shape[1]
+    stored = new & (slot < n_slots)
+    # what is not stored goes to one slot too many, which is cut off again
+    bin_of_slot = torch.nn.functional.pad(table.bin_of_slot, (0, 1))
+    index = torch.arange(new.shape[1], device=new.device).expand_as(slot)
+    bin_of_slot = bin_of_slot.scatter_(1, torch.where(stored, slot, n_slots), index)[:, :n_slots]
     n_stored = stored.sum(dim=-1)
     return (
         SlotTable(
-            bin_of_slot=bin_of_slot,
+            bin_of_slot=bin_of_slot.contiguous(),
             known=table.known | new,
             count=table.count + n_stored,
             dropped=table.dropped + new.sum(dim=-1) - n_stored,

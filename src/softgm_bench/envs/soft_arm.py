@@ -1,31 +1,26 @@
 """``SoftArmEnv``: N sections of one Cosserat-rod arm as cooperating agents, batched over environments."""
 
+from collections.abc import Callable, Mapping
+
 import torch
 from tensordict import TensorClass, TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from softgm_bench.envs import keys
 from softgm_bench.envs.reward import reward_terms
-from softgm_bench.envs.sensing import (
-    Bins,
-    SlotTable,
-    bins_per_cylinder,
-    cut_into_bins,
-    discover,
-    empty_table,
-    observe_slots,
-    sense,
-)
+from softgm_bench.envs.sensing import Bins, Sight, SlotTable, bins_per_cylinder, cut_into_bins, empty_table, look
+from softgm_bench.envs.specs import DIRECTIONS, make_specs
 from softgm_bench.envs.tasks import Scene, Task
 from softgm_bench.rod.actuation import Actuation, control_points
 from softgm_bench.rod.backend import Backend
-from softgm_bench.rod.contact import contact_nodes, element_radius
+from softgm_bench.rod.contact_nodes import contact_nodes
+from softgm_bench.rod.dense import dense
+from softgm_bench.rod.divergence import diverged
 from softgm_bench.rod.parameters import rod_constants
-from softgm_bench.rod.state import RodState, dilatation, straight_rods
+from softgm_bench.rod.state import RodState, straight_rods
 
-DIRECTIONS = 2  # normal and binormal
+Key = str | tuple[str, str]
 
 
 class Simulation(TensorClass):
@@ -59,6 +54,8 @@ class SoftArmEnv(EnvBase):
     partial (TorchRL's ``_reset`` mask) and draw scenes from the environment's own generator. A state that is not
     finite, or an element whose dilatation leaves the task's range, terminates that environment alone as ``diverged``;
     its last good state is what is observed.
+
+    On a device other than the CPU nothing here waits for the device: see ``softgm_bench.rod.dense``.
     """
 
     def __init__(
@@ -101,6 +98,7 @@ class SoftArmEnv(EnvBase):
             config.actuation.basis,
             config.actuation.scaling,
             device=self.device,
+            dtype=dtype,
         )
         arc_length = control_points(config.n_agents, parameters.base_length)
         nodes = torch.as_tensor(arc_length) * (parameters.n_elements / parameters.base_length)
@@ -112,60 +110,11 @@ class SoftArmEnv(EnvBase):
         self._n_bins = task.max_cylinders * n_bins
         self._generator = torch.Generator(device=self.device)
         self._generator.manual_seed(seed)
-        self._make_specs()
-        self._simulation = self._fresh(num_envs)
+        for name, spec in make_specs(num_envs, self.n_agents, self.n_slots, self.device).items():
+            setattr(self, name, spec)
+        self._simulation, _ = self._fresh(num_envs)
 
     # TorchRL's contract
-
-    def _make_specs(self) -> None:
-        batch, n, m = self.batch_size[0], self.n_agents, self.n_slots
-
-        def real(*shape: int) -> Unbounded:
-            return Unbounded(shape=(batch, *shape), dtype=torch.float32, device=self.device)
-
-        def flag(*shape: int) -> Binary:
-            return Binary(shape=(batch, *shape), dtype=torch.bool, device=self.device)
-
-        action = Bounded(-1.0, 1.0, shape=(batch, n, DIRECTIONS), dtype=torch.float32, device=self.device)
-        agents = {
-            "position": real(n, 3),
-            "velocity": real(n, 3),
-            "previous_action": action.clone(),
-            "edge": flag(n, m),
-        }
-        slots = {"descriptor": real(m, 9), "active": flag(m)}
-        info = {
-            name: flag(1) if name in ("success", "diverged") else real(1)
-            for _, name in (
-                keys.SUCCESS,
-                keys.DIVERGED,
-                keys.DISTANCE,
-                keys.TIP_STEP,
-                keys.CONTACT_NODES,
-                keys.DISCOVERED,
-                keys.DROPPED,
-                keys.TORQUE_PER_AGENT,
-                keys.TORQUE_JOINT,
-            )
-        }
-        terms = {name: real(1) for name in keys.REWARD_TERM_NAMES}
-        self.observation_spec = Composite(
-            agents=Composite(agents, shape=(batch, n), device=self.device),
-            slots=Composite(slots, shape=(batch, m), device=self.device),
-            tip=real(3),
-            target=real(3),
-            info=Composite(info, shape=(batch,), device=self.device),
-            reward_terms=Composite(terms, shape=(batch,), device=self.device),
-            shape=(batch,),
-            device=self.device,
-        )
-        self.action_spec = Composite(
-            agents=Composite(action=action, shape=(batch, n), device=self.device), shape=(batch,), device=self.device
-        )
-        self.reward_spec = real(1)
-        self.done_spec = Composite(
-            done=flag(1), terminated=flag(1), truncated=flag(1), shape=(batch,), device=self.device
-        )
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
@@ -174,74 +123,78 @@ class SoftArmEnv(EnvBase):
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDict:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None:
-            self._simulation = self._fresh(self.batch_size[0])
+            self._simulation, _ = self._fresh(self.batch_size[0])
             if self.stagger:
                 self._simulation.steps.random_(0, self.horizon, generator=self._generator)
         else:
-            chosen = mask.reshape(-1).nonzero().squeeze(-1)
-            if len(chosen):
-                self._simulation[chosen] = self._fresh(len(chosen))
-        simulation = self._simulation
-        zero = torch.zeros(self.batch_size, dtype=self._dtype, device=self.device)
-        info = dict.fromkeys(("tip_step", "torque_per_agent", "torque_joint"), zero)
-        never = torch.zeros_like(simulation.terminated)
-        observation = self._observe(simulation, self._sense(simulation))
-        observation["info"] = self._info(simulation, success=never, diverged=never, **info)
-        observation["reward_terms"] = {name: _column(zero) for name in keys.REWARD_TERM_NAMES}
-        observation.update(_done_flags(simulation))
-        return self._tensordict(observation)
+            self._begin_again(mask.reshape(-1))
+        return self._first_frame(self._simulation, self._look(self._simulation))
+
+    def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """What ``EnvBase.maybe_reset`` does, computing only the environments that are reset.
+
+        Where asking whether there are any would mean to wait for the device, all of them are computed and masked.
+        """
+        done = tensordict.get(keys.DONE)
+        if not dense(self.device) and not bool(done.any()):
+            return tensordict
+        mask = done.reshape(-1)
+        rows, fresh, sight = self._begin_again(mask)
+
+        def merged(old: Tensor, new: Tensor) -> Tensor:
+            if rows is None:
+                return torch.where(mask.view(-1, *(1,) * (old.ndim - 1)), new, old)
+            return old.index_copy(0, rows, new)
+
+        _put(self._first_frame(fresh, sight), tensordict, merged)
+        return tensordict
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        before = self._simulation
-        config = self.task.config
+        simulation, config = self._simulation, self.task.config
+        rod, scene, previous_action = simulation.rod, simulation.scene, simulation.previous_action
+        terminated, truncated = simulation.terminated, simulation.truncated
         action = tensordict.get(keys.ACTION).clamp(-1.0, 1.0)
-        active = ~(before.terminated | before.truncated)
-        rod = self.backend.control_step(
-            before.rod,
-            self._actuation.couple(action, self._dtype),
-            cylinders=before.scene.cylinders if self.task.max_cylinders else None,
+        active = ~(terminated | truncated)
+        moved = self.backend.control_step(
+            rod,
+            self._actuation.couple(action),
+            cylinders=scene.cylinders if self.task.max_cylinders else None,
             active=active,
         )
-        diverged = self._diverged(rod, config.min_dilatation, config.max_dilatation)
-        if bool(diverged.any()):
-            rod[diverged] = before.rod[diverged]
-        now = before.replace(rod=rod, steps=before.steps + active, previous_action=action.clone())
-        sensed = self._sense(now)
-        now.table, new_bins = discover(before.table, sensed)
+        broken = diverged(moved, self._rest_length, config.min_dilatation, config.max_dilatation)
+        if dense(self.device) or bool(broken.any()):
+            moved = rod.where(broken, moved)
+        simulation.rod, simulation.previous_action = moved, action
+        simulation.steps = steps = simulation.steps + active
+        sight = self._look(simulation)
+        simulation.table = sight.table
 
-        distance = _distance(now)
-        success = (distance < config.success_radius) & ~diverged
-        now.terminated = before.terminated | (active & (success | diverged))
-        now.truncated = before.truncated | (active & (now.steps >= self.horizon) & ~now.terminated)
-        info = self._info(
-            now,
-            success=success,
-            diverged=diverged,
-            tip_step=(now.rod.position[..., -1] - before.rod.position[..., -1]).norm(dim=-1),
-            **self._torques(action),
-        )
+        tip, previous_tip, target = moved.position[..., -1], rod.position[..., -1], scene.target
+        distance = (tip - target).norm(dim=-1)
+        success = (distance < config.success_radius) & ~broken
+        simulation.terminated = terminated = terminated | (active & (success | broken))
+        simulation.truncated = truncated | (active & (steps >= self.horizon) & ~terminated)
+        touching = self._count_contacts(simulation)
         terms = reward_terms(
             config.reward,
             distance=distance,
-            previous_distance=_distance(before),
+            previous_distance=(previous_tip - target).norm(dim=-1),
             action=action,
-            previous_action=before.previous_action,
-            contact_nodes=info["contact_nodes"].squeeze(-1),
-            new_bins=new_bins,
+            previous_action=previous_action,
+            contact_nodes=touching,
+            new_bins=sight.new,
             success=success,
         )
-        self._simulation = now
-        out = self._observe(now, sensed)
-        out["info"] = info
-        out["reward_terms"] = {name: _column(value) for name, value in terms.items()}
-        out["reward"] = _column(sum(terms.values(), torch.zeros_like(distance)))
-        out.update(_done_flags(now))
-        return self._tensordict(out)
+        tip_step = (tip - previous_tip).norm(dim=-1)
+        numbers = self._numbers(sight, distance, touching, tip_step, *self._torques(action))
+        numbers |= {(keys.REWARD_TERMS, name): value for name, value in terms.items()}
+        numbers[keys.REWARD] = sum(terms.values(), torch.zeros_like(distance))
+        return self._frame(simulation, sight, numbers, success, broken)
 
     # the parts of a step
 
-    def _fresh(self, count: int) -> Simulation:
-        """Episodes at their beginning, scenes drawn from the own generator."""
+    def _fresh(self, count: int) -> tuple[Simulation, Sight]:
+        """Episodes at their beginning, scenes drawn from the own generator, and what is seen there."""
         config = self.task.config
         scene = self.task.sample(count, self._generator).apply(self._real)
         bins = cut_into_bins(scene.cylinders, config.bin_length, self.task.max_cylinder_length)
@@ -257,8 +210,25 @@ class SoftArmEnv(EnvBase):
             truncated=never.clone(),
             batch_size=[count],
         )
-        simulation.table, _ = discover(simulation.table, self._sense(simulation))
-        return simulation
+        sight = self._look(simulation)
+        simulation.table = sight.table
+        return simulation, sight
+
+    def _begin_again(self, mask: Tensor) -> tuple[Tensor | None, Simulation, Sight]:
+        """Replace the episodes in ``mask``, ``(num_envs,)``, by new ones.
+
+        Returns:
+            The replaced rows, and new episodes for these; on a device that must not be waited for, None, and new
+            episodes for all rows, of which those in ``mask`` are used.
+        """
+        if dense(self.device):
+            fresh, sight = self._fresh(len(mask))
+            self._simulation = fresh.where(mask, self._simulation)
+            return None, fresh, sight
+        rows = mask.nonzero().squeeze(-1)
+        fresh, sight = self._fresh(len(rows))
+        self._simulation[rows] = fresh
+        return rows, fresh, sight
 
     def _real(self, value: Tensor) -> Tensor:
         return value.to(self._dtype) if value.is_floating_point() else value
@@ -267,61 +237,92 @@ class SoftArmEnv(EnvBase):
         """``(num_envs, 3, n_nodes)`` to the agents' nodes, ``(num_envs, n_agents, 3)``."""
         return of_nodes.index_select(-1, self._agent_node).transpose(-1, -2)
 
-    def _sense(self, simulation: Simulation) -> Tensor:
-        return sense(self._agents(simulation.rod.position), simulation.bins, self.task.config.sensing_radius)
+    def _look(self, simulation: Simulation) -> Sight:
+        config = self.task.config
+        return look(
+            self._agents(simulation.rod.position),
+            simulation.scene.cylinders,
+            simulation.bins,
+            simulation.table,
+            config.sensing_radius,
+            config.bin_length,
+        )
 
-    def _observe(self, simulation: Simulation, sensed: Tensor) -> dict:
-        descriptor, active, edge = observe_slots(simulation.table, simulation.bins, sensed)
-        return {
-            "agents": {
-                "position": _float32(self._agents(simulation.rod.position)),
-                "velocity": _float32(self._agents(simulation.rod.velocity)),
-                "previous_action": simulation.previous_action.clone(),
-                "edge": edge,
-            },
-            "slots": {"descriptor": _float32(descriptor), "active": active},
-            "tip": _float32(simulation.rod.position[..., -1]),
-            "target": _float32(simulation.scene.target),
-        }
+    def _count_contacts(self, simulation: Simulation) -> Tensor:
+        """C_t, ``(num_envs,)`` int64."""
+        if not self.task.max_cylinders:
+            return torch.zeros_like(simulation.steps)
+        return contact_nodes(simulation.rod.position, self._volume, simulation.scene.cylinders).sum(dim=-1)
 
-    def _info(self, simulation: Simulation, **values: Tensor) -> dict[str, Tensor]:
-        """Entries under ``info``, ``(num_envs, 1)``."""
-        position = simulation.rod.position
-        if self.task.max_cylinders:
-            radius = element_radius(position, self._volume)
-            touching = contact_nodes(position, radius, simulation.scene.cylinders).sum(dim=-1)
-        else:
-            touching = torch.zeros_like(simulation.steps)
-        values = {
-            "distance": _distance(simulation),
-            "contact_nodes": touching,
-            "discovered": simulation.table.count,
-            "dropped": simulation.table.dropped,
-            **values,
-        }
-        return {name: _column(value) for name, value in values.items()}
-
-    def _torques(self, action: Tensor) -> dict[str, Tensor]:
+    def _torques(self, action: Tensor) -> tuple[Tensor, Tensor]:
         """The paper's formula (mean of the agents' norms) and the scale of its table (norm over all), N m."""
         torque = self.task.config.actuation.max_torque * action
+        return torque.norm(dim=-1).mean(dim=-1), torque.flatten(1).norm(dim=-1)
+
+    # what is written to tensordicts
+
+    def _first_frame(self, simulation: Simulation, sight: Sight) -> TensorDict:
+        """Entries of a reset."""
+        rod = simulation.rod
+        distance = (rod.position[..., -1] - simulation.scene.target).norm(dim=-1)
+        zero, never = torch.zeros_like(distance), torch.zeros_like(simulation.terminated)
+        numbers = self._numbers(sight, distance, self._count_contacts(simulation), zero, zero, zero)
+        numbers |= {(keys.REWARD_TERMS, name): zero for name in keys.REWARD_TERM_NAMES}
+        return self._frame(simulation, sight, numbers, never, never.clone())
+
+    def _numbers(
+        self,
+        sight: Sight,
+        distance: Tensor,
+        touching: Tensor,
+        tip_step: Tensor,
+        torque_per_agent: Tensor,
+        torque_joint: Tensor,
+    ) -> dict[Key, Tensor]:
+        """Numbers under ``info`` by key, ``(num_envs,)`` each."""
         return {
-            "torque_per_agent": torque.norm(dim=-1).mean(dim=-1),
-            "torque_joint": torque.flatten(1).norm(dim=-1),
+            keys.DISTANCE: distance,
+            keys.TIP_STEP: tip_step,
+            keys.CONTACT_NODES: touching,
+            keys.DISCOVERED: sight.table.count,
+            keys.DROPPED: sight.table.dropped,
+            keys.TORQUE_PER_AGENT: torque_per_agent,
+            keys.TORQUE_JOINT: torque_joint,
         }
 
-    def _diverged(self, rod: RodState, low: float, high: float) -> Tensor:
-        stretch = dilatation(rod.position, self._rest_length)
-        good = ((stretch >= low) & (stretch <= high)).all(dim=-1)  # false for NaN
-        for rates in (rod.velocity, rod.omega, rod.director):
-            good &= rates.isfinite().flatten(1).all(dim=-1)
-        return ~good
-
-    def _tensordict(self, entries: dict) -> TensorDict:
-        batch, n, m = self.batch_size[0], self.n_agents, self.n_slots
-        out = TensorDict(entries, batch_size=self.batch_size, device=self.device)
-        out["agents"].batch_size = [batch, n]
-        out["slots"].batch_size = [batch, m]
-        return out
+    def _frame(
+        self, simulation: Simulation, sight: Sight, numbers: Mapping[Key, Tensor], success: Tensor, broken: Tensor
+    ) -> TensorDict:
+        """Everything that a step or a reset writes, in tensors of its own."""
+        rod = simulation.rod
+        terminated, truncated = simulation.terminated.unsqueeze(-1), simulation.truncated.unsqueeze(-1)
+        position = rod.position
+        entries: dict[str, dict[str, Tensor]] = {
+            "agents": {
+                "position": _float32(self._agents(position)),
+                "velocity": _float32(self._agents(rod.velocity)),
+                "previous_action": simulation.previous_action.clone(),
+                "edge": sight.edge,
+            },
+            "slots": {"descriptor": sight.descriptor, "active": sight.active},
+            "info": {"success": success.unsqueeze(-1), "diverged": broken.unsqueeze(-1)},
+            keys.REWARD_TERMS: {},
+        }
+        root = {
+            "tip": _float32(position[..., -1]),
+            "target": _float32(simulation.scene.target),
+            "terminated": terminated.clone(),
+            "truncated": truncated.clone(),
+            "done": terminated | truncated,
+        }
+        for key, column in zip(numbers, _columns(*numbers.values()), strict=True):
+            (root if isinstance(key, str) else entries[key[0]])[key if isinstance(key, str) else key[1]] = column
+        batch = list(simulation.batch_size)
+        sizes = {"agents": [*batch, self.n_agents], "slots": [*batch, self.n_slots]}
+        groups = {
+            name: TensorDict(group, sizes.get(name, batch), device=self.device) for name, group in entries.items()
+        }
+        return TensorDict(groups | root, batch, device=self.device)
 
     # what checkpoints need
 
@@ -342,21 +343,19 @@ class SoftArmEnv(EnvBase):
         self._simulation.update_(state)
 
 
-def _distance(simulation: Simulation) -> Tensor:
-    """Tip to target, m, ``(num_envs,)``."""
-    return (simulation.rod.position[..., -1] - simulation.scene.target).norm(dim=-1)
+def _put(new: TensorDictBase, into: TensorDictBase, merged: Callable[[Tensor, Tensor], Tensor]) -> None:
+    """Replace every entry of ``into`` that is in ``new`` by ``merged(old, new)``."""
+    for name, value in new.items():
+        if isinstance(value, TensorDictBase):
+            _put(value, into.get(name), merged)
+        else:
+            into.set(name, merged(into.get(name), value))
 
 
-def _column(value: Tensor) -> Tensor:
-    """``(num_envs,)`` to ``(num_envs, 1)``, flags as bool and numbers as float32."""
-    value = value.unsqueeze(-1)
-    return value if value.dtype == torch.bool else value.to(torch.float32)
+def _columns(*values: Tensor) -> tuple[Tensor, ...]:
+    """``(num_envs,)`` of any numbers to ``(num_envs, 1)`` float32."""
+    return torch.stack(values).to(torch.float32).unsqueeze(-1).unbind(0)
 
 
 def _float32(value: Tensor) -> Tensor:
     return value.to(torch.float32, copy=True)
-
-
-def _done_flags(simulation: Simulation) -> dict[str, Tensor]:
-    terminated, truncated = simulation.terminated.unsqueeze(-1), simulation.truncated.unsqueeze(-1)
-    return {"terminated": terminated.clone(), "truncated": truncated.clone(), "done": terminated | truncated}

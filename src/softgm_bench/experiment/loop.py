@@ -14,7 +14,7 @@ from torchrl.collectors import Collector
 from torchrl.envs.utils import ExplorationType
 
 from softgm_bench.algorithms.ppo import PPO
-from softgm_bench.config import Config, UserError, available_threads, plain
+from softgm_bench.config import Config, UserError, available_threads, dtype_of, plain
 from softgm_bench.envs import SoftArmEnv, make_env
 from softgm_bench.experiment import checkpoint, run_folder
 from softgm_bench.experiment.evaluation import DISCOUNT, EpisodeRecords, evaluate
@@ -104,7 +104,7 @@ def set_threads(threads: int | None) -> int:
     """Let torch and Numba use this many threads, or all there are; returns how many."""
     count = threads or available_threads()
     torch.set_num_threads(count)
-    numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
+    numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))
     return count
 
 
@@ -129,6 +129,7 @@ def _make_env(config: Config, num_envs: int, seed: int, horizon: int | None, sta
         horizon=horizon,
         device=config.device,
         backend=config.backend,
+        dtype=dtype_of(config),
         stagger=stagger,
     )
 
@@ -161,6 +162,7 @@ def _batches(run: Run) -> Iterator[TensorDictBase]:
         total_frames=_iterations(run.config) * _frames_per_iteration(run.config),
         exploration_type=ExplorationType.RANDOM,
         auto_register_policy_transforms=False,
+        track_traj_ids=False,  # nobody reads them, and counting them would wait for the device at every step
     )
     try:
         yield from collector

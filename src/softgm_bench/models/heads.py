@@ -160,6 +160,12 @@ class TeamValue(TensorDictModuleBase):
         return td.set(STATE_VALUE, self.function(self.encoder(td).mean(dim=-2)))
 
 
+class SquashedNormal(TanhNormal):
+    """TorchRL's ``TanhNormal`` between -1 and 1, which does not ask the device whether these are its bounds."""
+
+    non_trivial_max = non_trivial_min = property(lambda self: False, lambda self, value: None)
+
+
 def build_actor(
     encoder_config: Any, n_agents: int, n_slots: int, config: ActorConfig
 ) -> ProbabilisticTensorDictSequential:
@@ -174,7 +180,7 @@ def build_actor(
     sample = ProbabilisticTensorDictModule(
         in_keys={"loc": LOC, "scale": SCALE},
         out_keys=[keys.ACTION],
-        distribution_class=TanhNormal,
+        distribution_class=SquashedNormal,
         distribution_kwargs={"tanh_loc": True, "upscale": config.mean_bound, "event_dims": 1},
         return_log_prob=True,
         log_prob_key=keys.LOG_PROB,

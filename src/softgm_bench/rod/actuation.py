@@ -54,8 +54,9 @@ class Actuation:
         basis: str = "interpolating",
         scaling: str = "per_length",
         device: torch.device | str = "cpu",
+        dtype: torch.dtype = torch.float64,
     ) -> None:
-        """Evaluate the basis once, at the elements' rest centres.
+        """Evaluate the basis once, at the elements' rest centres; couples are of type ``dtype``.
 
         ``per_length`` reads the torque field as couple per unit length, so that an element receives ``tau(s_k) ds``;
         ``per_element`` gives each element ``tau(s_k)`` itself, which tears the paper's arm apart: comparison only.
@@ -69,14 +70,15 @@ class Actuation:
         ends = np.concatenate([[0.0], np.cumsum(constants.rest_length)])
         basis_values = torque_basis(n_agents, 0.5 * (ends[1:] + ends[:-1]), parameters.base_length, basis)
         weight = constants.rest_length if scaling == "per_length" else np.ones(parameters.n_elements)
-        self.matrix = torch.as_tensor(max_torque * basis_values * weight, dtype=torch.float64, device=device)
+        self.matrix = torch.as_tensor(max_torque * basis_values * weight, dtype=dtype, device=device)
 
-    def couple(self, action: Tensor, dtype: torch.dtype = torch.float64) -> Tensor:
+    def couple(self, action: Tensor) -> Tensor:
         """Couple on each element, N m, from actions ``(num_envs, n_agents, 2)`` (normal, binormal).
 
         Returns:
             ``(num_envs, 3, n_elements)`` in directors' components; the tangential row is zero.
         """
-        matrix = self.matrix.to(dtype)
-        bending = torch.einsum("...ia,ik->...ak", action.to(dtype), matrix)
+        # No matrix product: its rounding may depend on the batch, and an environment would see its neighbours.
+        amplitude = action.to(self.matrix.dtype).transpose(-1, -2).unsqueeze(-1)
+        bending = (amplitude * self.matrix).sum(dim=-2)
         return torch.cat([bending, torch.zeros_like(bending[..., :1, :])], dim=-2)

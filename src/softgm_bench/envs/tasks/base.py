@@ -3,13 +3,17 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorClass
 from torch import Tensor
 
+from softgm_bench.rod.dense import dense
 from softgm_bench.rod.state import Cylinders
+
+POOL = 4096  # fewest values among which admissible ones are looked for where nobody may count them
 
 Range = tuple[float, float]
 
@@ -121,12 +125,28 @@ def uniform_box(count: int, bounds: tuple[Range, Range, Range], generator: torch
     return torch.stack([uniform(count, axis, generator) for axis in bounds], dim=-1)
 
 
-def redraw_until(draw: Callable[[int], Tensor], accept: Callable[[Tensor], Tensor], count: int, what: str) -> Tensor:
+@lru_cache
+def constant(values: tuple, device: torch.device) -> Tensor:
+    """Nested tuples of numbers as a float64 tensor that is copied to the device once; not to be changed."""
+    return torch.tensor(values, dtype=torch.float64, device=device)
+
+
+def redraw_until(
+    draw: Callable[[int], Tensor],
+    accept: Callable[[Tensor], Tensor],
+    count: int,
+    what: str,
+    device: torch.device,
+) -> Tensor:
     """Rejection sampling for a whole batch: redraw the rejected rows until all are accepted.
+
+    Where nobody may look at values (``dense``) see ``first_accepted``.
 
     Raises:
         ValueError: if some rows are still rejected after 1000 rounds: the ranges leave (almost) nothing.
     """
+    if dense(device):
+        return first_accepted(draw, accept, count)
     values = draw(count)
     for _ in range(1000):
         rejected = (~accept(values)).nonzero().squeeze(-1)
@@ -134,6 +154,21 @@ def redraw_until(draw: Callable[[int], Tensor], accept: Callable[[Tensor], Tenso
             return values
         values[rejected] = draw(len(rejected))
     raise ValueError(f"task: no admissible {what} found in 1000 draws: widen its ranges")
+
+
+def first_accepted(draw: Callable[[int], Tensor], accept: Callable[[Tensor], Tensor], count: int) -> Tensor:
+    """Rejection sampling in shapes that do not depend on values: the first ``count`` accepted ones of a large pool.
+
+    Should the pool hold fewer, which takes an acceptance of a few per cent, rows share a value.
+    """
+    size = max(POOL, 16 * count)
+    values = draw(size)
+    accepted = accept(values)
+    rank = torch.where(accepted, accepted.cumsum(0) - 1, size)
+    index = torch.arange(size, device=values.device)
+    # what is not accepted goes to one place too many
+    chosen = index.new_zeros(size + 1).scatter_(0, rank, index)
+    return values[chosen[index[:count] % accepted.sum().clamp(min=1)]]
 
 
 def no_cylinders(count: int, device: torch.device) -> Cylinders:
@@ -161,7 +196,7 @@ def upright_cylinders(xy: Tensor, bottom: Tensor, top: Tensor, radius: float, ma
         mask: which exist, ``(count, n_cylinders)`` bool.
     """
     axis = torch.zeros((*bottom.shape, 3), dtype=bottom.dtype, device=bottom.device)
-    axis[..., 2] = 1.0
+    axis[..., 2].fill_(1.0)
     return Cylinders(
         start=torch.cat([xy, bottom.unsqueeze(-1)], dim=-1),
         axis=axis,

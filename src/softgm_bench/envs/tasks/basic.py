@@ -5,7 +5,16 @@ from dataclasses import dataclass
 
 import torch
 
-from softgm_bench.envs.tasks.base import Range, Scene, Task, TaskConfig, no_cylinders, redraw_until, uniform
+from softgm_bench.envs.tasks.base import (
+    Range,
+    Scene,
+    Task,
+    TaskConfig,
+    constant,
+    no_cylinders,
+    redraw_until,
+    uniform,
+)
 
 
 @dataclass
@@ -26,7 +35,8 @@ class Basic(Task):
     def sample(self, count: int, generator: torch.Generator) -> Scene:
         """Draw ``count`` scenes."""
         c = self.config
-        tip = torch.tensor(c.resting_tip, dtype=torch.float64, device=generator.device)
+        device = generator.device
+        tip = constant(tuple(c.resting_tip), device)
 
         def draw(n: int) -> torch.Tensor:
             distance = uniform(n, c.target_distance, generator)
@@ -38,5 +48,8 @@ class Basic(Task):
             )
             return distance.unsqueeze(-1) * direction
 
-        target = redraw_until(draw, lambda x: (x - tip).norm(dim=-1) >= c.min_distance_to_resting_tip, count, "target")
-        return Scene(target=target, cylinders=no_cylinders(count, generator.device), batch_size=[count])
+        def accept(target: torch.Tensor) -> torch.Tensor:
+            return (target - tip).norm(dim=-1) >= c.min_distance_to_resting_tip
+
+        target = redraw_until(draw, accept, count, "target", device)
+        return Scene(target=target, cylinders=no_cylinders(count, device), batch_size=[count])

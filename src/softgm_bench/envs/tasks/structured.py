@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import torch
 
-from softgm_bench.envs.tasks.base import Range, Scene, Task, TaskConfig, uniform_box, upright_cylinders
+from softgm_bench.envs.tasks.base import Range, Scene, Task, TaskConfig, constant, uniform_box, upright_cylinders
 
 
 @dataclass
@@ -34,9 +34,7 @@ class Structured(Task):
     def sample(self, count: int, generator: torch.Generator) -> Scene:
         """Draw ``count`` scenes."""
         c = self.config
-        xy = torch.tensor(
-            [[c.post_x, -c.post_y], [c.post_x, c.post_y]], dtype=torch.float64, device=generator.device
-        ).expand(count, 2, 2)
+        xy = constant(((c.post_x, -c.post_y), (c.post_x, c.post_y)), generator.device).expand(count, 2, 2)
         bottom = torch.full_like(xy[..., 0], c.post_z[0])
         top = torch.full_like(bottom, c.post_z[1])
         posts = upright_cylinders(xy, bottom, top, c.post_radius, torch.ones_like(bottom, dtype=torch.bool))

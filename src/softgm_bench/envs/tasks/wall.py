@@ -6,7 +6,16 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from softgm_bench.envs.tasks.base import Range, Scene, Task, TaskConfig, redraw_until, uniform_box, upright_cylinders
+from softgm_bench.envs.tasks.base import (
+    Range,
+    Scene,
+    Task,
+    TaskConfig,
+    constant,
+    redraw_until,
+    uniform_box,
+    upright_cylinders,
+)
 from softgm_bench.rod.state import Cylinders
 
 
@@ -52,7 +61,8 @@ class Wall(Task):
             )
         width = config.wall_y[1] - config.wall_y[0]
         n_columns = math.floor(width / config.column_spacing + 1e-9) + 1
-        self.column_y = config.wall_y[0] + config.column_spacing * torch.arange(n_columns, dtype=torch.float64)
+        column_y = config.wall_y[0] + config.column_spacing * torch.arange(n_columns, dtype=torch.float64)
+        self.column_y: tuple[float, ...] = tuple(column_y.tolist())
         most_cut = math.floor(config.opening_side / config.column_spacing + 1e-9) + 1
         self.max_cylinders = n_columns + min(most_cut, n_columns)
         self.max_cylinder_length = config.wall_z[1] - config.wall_z[0]
@@ -70,15 +80,16 @@ class Wall(Task):
             opening, target = pair.unbind(dim=1)
             return opening.norm(dim=-1) + (target - opening).norm(dim=-1) <= c.max_path
 
-        opening, target = redraw_until(draw, reachable, count, "pair of opening and target").unbind(dim=1)
+        pair = redraw_until(draw, reachable, count, "pair of opening and target", generator.device)
+        opening, target = pair.unbind(dim=1)
         return Scene(target=target, cylinders=self._columns(opening), batch_size=[count])
 
     def _columns(self, opening: Tensor) -> Cylinders:
         c = self.config
         half = 0.5 * c.opening_side
-        column_y = self.column_y.to(opening.device)
+        column_y = constant(self.column_y, opening.device)
         cut = (column_y - opening[:, 1:2]).abs() <= half + 1e-12  # (count, n_columns)
-        low, high = opening.new_tensor(c.wall_z).expand(len(opening), 2).unsqueeze(1).unbind(-1)
+        low, high = constant(tuple(c.wall_z), opening.device).expand(len(opening), 2).unsqueeze(1).unbind(-1)
         lower_top = torch.where(cut, opening[:, 2:3] - half, high)
         # lower (or whole) parts first, upper parts behind them; then existing ones to the front
         bottom = torch.cat([low.expand_as(cut), (opening[:, 2:3] + half).expand_as(cut)], dim=1)
