@@ -7,7 +7,7 @@ from torch import Tensor
 from softgm_bench.rod.parameters import RodParameters
 from softgm_bench.rod.state import Cylinders, RodState
 
-BACKENDS = ("numba", "torch")
+BACKENDS = ("numba", "torch", "cuda")
 
 
 class Backend(Protocol):
@@ -29,7 +29,7 @@ class Backend(Protocol):
 
 
 def make_backend(name: str, parameters: RodParameters) -> Backend:
-    """Build ``numba`` (fused, CPU) or ``torch`` (reference, any device, differentiable).
+    """Build ``numba`` (fused, CPU), ``cuda`` (fused, GPU) or ``torch`` (reference, any device, differentiable).
 
     Raises:
         ValueError: for another name.
@@ -42,4 +42,8 @@ def make_backend(name: str, parameters: RodParameters) -> Backend:
         from softgm_bench.rod.torch_backend import TorchBackend
 
         return TorchBackend(parameters)
+    if name == "cuda":
+        from softgm_bench.rod.cuda_backend import CudaBackend
+
+        return CudaBackend(parameters)
     raise ValueError(f"backend is {name!r}: choose one of {', '.join(BACKENDS)}")

@@ -1,0 +1,128 @@
+"""The GPU backend: a whole control step of every environment in one kernel launch, on torch's tensors and stream."""
+
+import warnings
+from typing import Any
+
+import numpy as np
+import torch
+from numba import cuda
+from numba.core.errors import NumbaPerformanceWarning
+from torch import Tensor
+
+from softgm_bench.rod.cuda_kernel import SIMULATED, Coefficients, coefficients
+from softgm_bench.rod.cuda_step import MAX_ELEMENTS, ROWS, make_step, scratch_columns
+from softgm_bench.rod.parameters import RodParameters
+from softgm_bench.rod.state import Cylinders, RodState, check_inputs
+
+# Numba warns of few rods; that many are all that the caller has.
+warnings.filterwarnings("ignore", message="Grid size", category=NumbaPerformanceWarning)
+
+_REAL = {torch.float64: np.float64, torch.float32: np.float32}
+
+
+class CudaBackend:
+    """Rod dynamics on NVIDIA GPUs for float64 and float32 states; equal to ``TorchBackend`` to round-off.
+
+    Nothing is copied to or from the host and nothing waits for the GPU: a step is one launch on torch's current stream.
+    """
+
+    def __init__(self, parameters: RodParameters) -> None:
+        """Prepare for one arm; compilation happens at the first step of each precision, with and without cylinders.
+
+        Raises:
+            ValueError: if the kernel cannot hold such a rod.
+        """
+        if parameters.n_elements > MAX_ELEMENTS:
+            raise ValueError(
+                f"rod.n_elements is {parameters.n_elements}: the cuda backend holds at most {MAX_ELEMENTS}"
+            )
+        self.parameters = parameters
+        self._coefficients: dict[type, Coefficients] = {real: coefficients(parameters, real) for real in _REAL.values()}
+
+    def control_step(
+        self,
+        state: RodState,
+        couple: Tensor,
+        force: Tensor | None = None,
+        cylinders: Cylinders | None = None,
+        active: Tensor | None = None,
+        substeps: int | None = None,
+    ) -> RodState:
+        """Advance every rod by one control step.
+
+        Args:
+            state: not changed; float64 or float32 on a CUDA device, as all tensors.
+            couple: external couple on elements in the material frame, N m, ``(num_envs, 3, n_elements)``.
+            force: external force on nodes in the world frame, N, ``(num_envs, 3, n_nodes)``; gravity is added.
+            cylinders: what the rods may touch.
+            active: ``(num_envs,)`` bool; rods that are not come back as they were.
+            substeps: of this step, the parameters' number by default.
+
+        Returns:
+            A new state.
+
+        Raises:
+            ValueError: if the arguments' shapes do not fit together, or a tensor is not where the state is.
+        """
+        check_inputs(self.parameters, state, couple, force, cylinders, active)
+        device, dtype = state.position.device, state.position.dtype
+        _check_device(device, couple=couple, force=force, active=active, cylinders=cylinders)
+        if dtype not in _REAL:
+            raise ValueError(f"the state is {dtype}: the cuda backend computes in float64 or float32")
+        old = _inputs(dtype, state.position, state.director, state.velocity, state.omega)
+        new = [torch.empty_like(field) for field in old]
+        if len(couple) > 0:
+            # what is absent is never read; something of its type stands for it
+            none = cylinders is None or cylinders.mask.shape[1] == 0
+            contact = None if none else self.parameters.contact_model
+            nothing = torch.empty((1, 1, 1), dtype=dtype, device=device)
+            never = torch.empty((1, 1), dtype=torch.bool, device=device)
+            couple, force_or_nothing = _inputs(dtype, couple, nothing if force is None else force)
+            obstacles = [nothing, nothing, nothing[0], nothing[0], never]
+            if cylinders is not None and contact is not None:
+                geometry = (cylinders.start, cylinders.axis, cylinders.length, cylinders.radius)
+                obstacles = [*_inputs(dtype, *geometry), cylinders.mask.contiguous()]
+            columns = scratch_columns(self.parameters.n_elements, _REAL[dtype])
+            scratch = torch.empty((len(couple), ROWS, columns), dtype=dtype, device=device) if columns else nothing
+            flags = never[0] if active is None else active.bool().contiguous()
+            _launch(
+                make_step(self.parameters.n_elements, _REAL[dtype], contact),
+                [*old, *new, couple, force_or_nothing, flags, *obstacles, scratch],
+                (int(force is not None), int(active is not None)),
+                self._coefficients[_REAL[dtype]],
+                self.parameters.substeps if substeps is None else substeps,
+            )
+        return RodState(*new, batch_size=state.batch_size)
+
+
+def _inputs(dtype: torch.dtype, *tensors: Tensor) -> list[Tensor]:
+    """What a kernel can read; no copies where dtype and layout are right already."""
+    return [tensor.detach().to(dtype).contiguous() for tensor in tensors]
+
+
+def _launch(kernel: Any, tensors: list[Tensor], given: tuple[int, int], constants: Coefficients, substeps: int) -> None:
+    """Enqueue a control step on torch's current stream of the tensors' device."""
+    position = tensors[0]
+    num_envs, _, n_nodes = position.shape
+    if SIMULATED:
+        kernel[num_envs, n_nodes](*(tensor.numpy() for tensor in tensors), *given, constants, substeps)
+        return
+    with cuda.gpus[position.device.index]:
+        arrays = [cuda.as_cuda_array(tensor, sync=False) for tensor in tensors]
+        stream = cuda.external_stream(torch.cuda.current_stream(position.device).cuda_stream)
+        kernel[num_envs, n_nodes, stream](*arrays, *given, constants, substeps)
+
+
+def _check_device(device: torch.device, **arguments: Tensor | Cylinders | None) -> None:
+    """Refuse tensors that the kernel cannot reach.
+
+    Raises:
+        ValueError: naming the first of them.
+    """
+    if device.type != "cuda" and not SIMULATED:
+        raise ValueError(f"the state is on {device}: the cuda backend needs it on a CUDA device")
+    for name, argument in arguments.items():
+        tensors = argument.values() if isinstance(argument, Cylinders) else (argument,)
+        for tensor in tensors:
+            if tensor is not None and tensor.device != device:
+                raise ValueError(f"{name} is on {tensor.device}: it must be on {device} as the state is")
