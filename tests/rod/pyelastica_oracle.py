@@ -31,7 +31,8 @@ class Trajectory(NamedTuple):
     director: Array  # (steps, 3, 3, n_elements)
     velocity: Array  # (steps, 3, n_nodes)
     omega: Array  # (steps, 3, n_elements)
-    contact_force: Array  # (steps,), the largest force of any cylinder on any node within the step, N
+    contact_force: Array  # (steps,), the largest force of the cylinders on any node within the step, N
+    missed: int  # contacts (cylinder and substep) that PyElastica's pruning did not, or would not, let through
 
 
 class _Simulator(ea.BaseSystemCollection, ea.Constraints, ea.Forcing, ea.Damping, ea.Contact):
@@ -69,15 +70,45 @@ class _LargestContactForce(ea.NoForces):
         self.record[-1] = max(self.record[-1], float(np.abs(system.external_forces - self.loads).max()))
 
 
+class _Pruning:
+    """Compute every pair and count the contacts that PyElastica's bounding boxes would have skipped.
+
+    With ``apply`` those contacts are counted as well, but what they add to the forces is taken back: PyElastica as
+    shipped.
+    """
+
+    def __init__(self, apply: bool):
+        self.apply, self.skips, self.missed = apply, False, 0
+        module = elastica.contact_forces
+        self._prune = module._prune_using_aabbs_rod_cylinder
+        self._forces = module._calculate_contact_forces_rod_cylinder
+
+    def prune(self, *arguments) -> int:
+        self.skips = bool(self._prune(*arguments))
+        return 0
+
+    def forces(self, *arguments) -> None:
+        if not self.skips:
+            self._forces(*arguments)
+            return
+        external_forces = arguments[8]
+        before = external_forces.copy()
+        self._forces(*arguments)
+        self.missed += not np.array_equal(before, external_forces)
+        if self.apply:
+            external_forces[...] = before
+
+
 @contextmanager
-def _without_pruning() -> Iterator[None]:
-    """PyElastica skips cylinders by bounding boxes, which miss contacts: compute every pair instead."""
-    original = elastica.contact_forces._prune_using_aabbs_rod_cylinder
-    elastica.contact_forces._prune_using_aabbs_rod_cylinder = lambda *arguments: 0
+def _watched_pruning(apply: bool) -> Iterator[_Pruning]:
+    module, pruning = elastica.contact_forces, _Pruning(apply)
+    module._prune_using_aabbs_rod_cylinder = pruning.prune
+    module._calculate_contact_forces_rod_cylinder = pruning.forces
     try:
-        yield
+        yield pruning
     finally:
-        elastica.contact_forces._prune_using_aabbs_rod_cylinder = original
+        module._prune_using_aabbs_rod_cylinder = pruning._prune
+        module._calculate_contact_forces_rod_cylinder = pruning._forces
 
 
 def straight_rod(parameters: RodParameters) -> ea.CosseratRod:
@@ -94,22 +125,28 @@ def straight_rod(parameters: RodParameters) -> ea.CosseratRod:
     )
 
 
-def build(parameters: RodParameters, loads: Loads, posts: Sequence[Post] = ()) -> tuple[_Simulator, ea.CosseratRod]:
-    """A simulator that still has to be finalised: the arm with its clamp, damper, loads and contacts, no more."""
-    simulator, rod = _Simulator(), straight_rod(parameters)
-    simulator.append(rod)
-    simulator.constrain(rod).using(ea.OneEndFixedBC, constrained_position_idx=(0,), constrained_director_idx=(0,))
-    simulator.dampen(rod).using(
-        ea.AnalyticalLinearDamper,
-        time_step=parameters.dt,
-        **{parameters.damping_protocol: parameters.damping_constant},
-    )
-    if any(parameters.gravity):
-        simulator.add_forcing_to(rod).using(ea.GravityForces, acc_gravity=np.array(parameters.gravity))
-    simulator.add_forcing_to(rod).using(_Given, loads=loads)
+def build(
+    parameters: RodParameters, loads: Loads, posts: Sequence[Post] = (), rods: int = 1
+) -> tuple[_Simulator, ea.CosseratRod]:
+    """A simulator that still has to be finalised, and its first arm: clamps, dampers, loads and contacts, no more.
+
+    Several ``rods`` stand in the same place under the same loads, touch the same posts and don't see each other.
+    """
+    simulator, arms = _Simulator(), [straight_rod(parameters) for _ in range(rods)]
+    for rod in arms:
+        simulator.append(rod)
+        simulator.constrain(rod).using(ea.OneEndFixedBC, constrained_position_idx=(0,), constrained_director_idx=(0,))
+        simulator.dampen(rod).using(
+            ea.AnalyticalLinearDamper,
+            time_step=parameters.dt,
+            **{parameters.damping_protocol: parameters.damping_constant},
+        )
+        if any(parameters.gravity):
+            simulator.add_forcing_to(rod).using(ea.GravityForces, acc_gravity=np.array(parameters.gravity))
+        simulator.add_forcing_to(rod).using(_Given, loads=loads)
     for post in posts:
-        _add_fixed_cylinder(simulator, rod, post, parameters)
-    return simulator, rod
+        _add_fixed_cylinder(simulator, arms, post, parameters)
+    return simulator, arms[0]
 
 
 def simulate(
@@ -118,8 +155,12 @@ def simulate(
     steps: int,
     posts: Sequence[Post] = (),
     force: Array | None = None,
+    pruning: bool = False,
 ) -> Trajectory:
-    """Run ``steps`` control steps; ``couple(step)`` is ``(3, n_elements)`` and ``force`` ``(3, n_nodes)``."""
+    """Run ``steps`` control steps; ``couple(step)`` is ``(3, n_elements)`` and ``force`` ``(3, n_nodes)``.
+
+    PyElastica skips cylinders by bounding boxes, which miss contacts: only with ``pruning`` it does so here.
+    """
     loads = Loads(np.zeros((3, parameters.n_elements)), force)
     simulator, rod = build(parameters, loads, posts)
     constant = np.array(parameters.gravity)[:, None] * rod.mass + (0.0 if force is None else force)
@@ -128,7 +169,7 @@ def simulate(
     simulator.finalize()
 
     stepper, time, states = ea.PositionVerlet(), np.float64(0.0), []
-    with _without_pruning():
+    with _watched_pruning(pruning) as watched:
         for step in range(steps):
             loads.couple[...] = couple(step)
             largest.append(0.0)
@@ -137,10 +178,12 @@ def simulate(
             collections = (rod.position_collection, rod.director_collection, rod.velocity_collection)
             states.append([array.copy() for array in (*collections, rod.omega_collection)])
     position, director, velocity, omega = (np.stack(series) for series in zip(*states, strict=True))
-    return Trajectory(position, director, velocity, omega, np.array(largest))
+    return Trajectory(position, director, velocity, omega, np.array(largest), watched.missed)
 
 
-def _add_fixed_cylinder(simulator: _Simulator, rod: ea.CosseratRod, post: Post, parameters: RodParameters) -> None:
+def _add_fixed_cylinder(
+    simulator: _Simulator, rods: Sequence[ea.CosseratRod], post: Post, parameters: RodParameters
+) -> None:
     axis = np.array(post.axis)
     normal = np.eye(3)[np.abs(axis).argmin()]
     normal = normal - (normal @ axis) * axis
@@ -149,13 +192,14 @@ def _add_fixed_cylinder(simulator: _Simulator, rod: ea.CosseratRod, post: Post, 
     )
     simulator.append(cylinder)
     simulator.constrain(cylinder).using(ea.OneEndFixedBC, constrained_position_idx=(0,), constrained_director_idx=(0,))
-    simulator.detect_contact_between(rod, cylinder).using(
-        ea.RodCylinderContact,
-        k=parameters.contact_stiffness,
-        nu=parameters.contact_damping,
-        velocity_damping_coefficient=parameters.velocity_damping_coefficient,
-        friction_coefficient=parameters.friction_coefficient,
-    )
+    for rod in rods:
+        simulator.detect_contact_between(rod, cylinder).using(
+            ea.RodCylinderContact,
+            k=parameters.contact_stiffness,
+            nu=parameters.contact_damping,
+            velocity_damping_coefficient=parameters.velocity_damping_coefficient,
+            friction_coefficient=parameters.friction_coefficient,
+        )
 
 
 def as_cylinders(per_environment: Sequence[Sequence[Post]], dtype: torch.dtype = torch.float64) -> Cylinders:
