@@ -1,0 +1,52 @@
+"""Rates measured as the best of several repetitions, so that other load on the machine spoils as little as possible."""
+
+import time
+from collections.abc import Callable
+
+import torch
+
+from softgm_bench.rod.backend import make_backend
+from softgm_bench.rod.parameters import RodParameters
+from softgm_bench.rod.state import Cylinders, straight_rods
+
+
+def best_rate(work: Callable[[], object], count: float, seconds: float, repetitions: int = 5) -> float:
+    """``count`` over the shortest time of ``work``, repeated at least ``repetitions`` times and ``seconds`` long."""
+    shortest, begin, done = float("inf"), time.perf_counter(), 0
+    while done < repetitions or time.perf_counter() - begin < seconds:
+        start = time.perf_counter()
+        work()
+        shortest, done = min(shortest, time.perf_counter() - start), done + 1
+    return count / shortest
+
+
+def sideways(parameters: RodParameters, num_envs: int, dtype: torch.dtype, peak: float = 4.0) -> torch.Tensor:
+    """A constant couple about d2 that leans the arm towards y, N m: ``(num_envs, 3, n_elements)``."""
+    couple = torch.zeros(num_envs, 3, parameters.n_elements, dtype=dtype)
+    couple[:, 1] = peak * parameters.base_length / parameters.n_elements
+    return couple
+
+
+def kernel_rate(
+    parameters: RodParameters,
+    dtype: torch.dtype,
+    num_envs: int,
+    cylinders: Cylinders | None = None,
+    couple: torch.Tensor | None = None,
+    backend: str = "numba",
+    seconds: float = 1.0,
+    warm_up: int = 10,
+    repetitions: int = 5,
+) -> float:
+    """Substeps per second over all rods, in whole control steps after ``warm_up`` of them."""
+    rod = make_backend(backend, parameters)
+    couple = sideways(parameters, num_envs, dtype) if couple is None else couple
+    state = straight_rods(parameters, num_envs, dtype)
+    for _ in range(warm_up):
+        state = rod.control_step(state, couple, cylinders=cylinders)
+
+    def work() -> None:
+        nonlocal state
+        state = rod.control_step(state, couple, cylinders=cylinders)
+
+    return best_rate(work, num_envs * parameters.substeps, seconds, repetitions)
