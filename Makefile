@@ -3,7 +3,7 @@ PYTHON ?= python3.11
 BIN := .venv/bin
 STAMP := .venv/.setup
 
-.PHONY: setup train test test-slow check bench
+.PHONY: setup train test test-slow check bench bench-gpu parity validation
 
 setup: $(STAMP)
 
@@ -26,5 +26,21 @@ check: setup
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 
+# Speed: rod and environment steps against PyElastica, distance to the roofline, scaling. About ten minutes.
 bench: setup
 	$(BIN)/python benchmarks/bench_rod.py
+	$(BIN)/python benchmarks/roofline.py
+	$(BIN)/python benchmarks/bench_env.py
+	$(BIN)/python benchmarks/bench_scaling.py
+
+# The same on an NVIDIA GPU.
+bench-gpu: setup
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[cuda]'
+	$(BIN)/python benchmarks/bench_gpu.py
+
+# Trust: every case of the parity suite as a table; solutions in closed form, energy, order in time, float32.
+parity: setup
+	$(BIN)/python benchmarks/parity.py
+
+validation: setup
+	$(BIN)/python benchmarks/validation.py
