@@ -47,6 +47,18 @@ def test_every_reward_term_has_a_column():
     assert [row[f"reward_{name}"] for name in keys.REWARD_TERM_NAMES] == list(range(8))
     assert row["discovered_bins"] == 2.5
     assert row["dropped_bins"] == 5.0
+    assert "difficulty" not in row
+
+
+def test_difficulty_has_a_column_where_there_is_a_curriculum():
+    after = TensorDict({}, [2, 3])
+    for name in keys.REWARD_TERM_NAMES:
+        after[keys.REWARD_TERMS, name] = torch.zeros(2, 3, 1)
+    infos = (keys.DISTANCE, keys.CONTACT_NODES, keys.DISCOVERED, keys.TORQUE_PER_AGENT, keys.TORQUE_JOINT, keys.DROPPED)
+    for key in infos:
+        after[key] = torch.zeros(2, 3, 1)
+    after[keys.DIFFICULTY] = torch.linspace(0.0, 1.0, 6).view(2, 3, 1)
+    assert step_metrics(TensorDict({"next": after}, [2, 3]))["difficulty"] == pytest.approx(0.5)
 
 
 def test_rows_are_on_disk_at_once_and_read_back_exactly(tmp_path):

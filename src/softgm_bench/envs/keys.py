@@ -1,7 +1,8 @@
 """Names of the environment's tensordict entries: the only thing that models share with environments.
 
-Shapes are for ``num_envs`` environments (B), N agents and M obstacle slots. Everything an actor may read is listed in
-``OBSERVATION``; relative quantities are functions of these entries and are computed inside the models.
+Shapes are for ``num_envs`` environments (B), N agents, M obstacle slots and P privileged numbers (the environment's
+``n_privileged``). Everything an actor may read is listed in ``OBSERVATION``; relative quantities are functions of these
+entries and are computed inside the models.
 """
 
 # What every actor and critic may read.
@@ -25,6 +26,10 @@ OBSERVATION = (
     TARGET,
 )
 
+# What the task knows of a scene beyond the observation: for critics, which only training has, and for policies that are
+# labelled as upper bounds. The entry is absent where P is 0.
+PRIVILEGED = "privileged"  # (B, P) float32; walls: the opening's centre (3) and side (1), m
+
 ACTION = ("agents", "action")  # (B, N, 2) float32 in [-1, 1]
 LOG_PROB = ("agents", "action_log_prob")  # (B, N)
 
@@ -43,6 +48,7 @@ DISCOVERED = ("info", "discovered")  # (B, 1) float32, bins in the table
 DROPPED = ("info", "dropped")  # (B, 1) float32, bins that found no free slot this episode
 TORQUE_PER_AGENT = ("info", "torque_per_agent")  # (B, 1) float32, mean over agents of ||u_i||, N m
 TORQUE_JOINT = ("info", "torque_joint")  # (B, 1) float32, norm over agents and axes, N m
+DIFFICULTY = ("info", "difficulty")  # (B, 1) float32, of the episode's scene, 1: the task's own; with a curriculum only
 REWARD_TERMS = "reward_terms"  # nested: the eight terms by name, (B, 1) float32 each
 REWARD_TERM_NAMES = (
     "distance",

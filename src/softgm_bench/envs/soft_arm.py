@@ -8,6 +8,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from softgm_bench.envs import keys
+from softgm_bench.envs.curriculum import Progress, difficulty, first_progress, note_ends
 from softgm_bench.envs.reward import reward_terms
 from softgm_bench.envs.sensing import Bins, Sight, SlotTable, bins_per_cylinder, cut_into_bins, empty_table, look
 from softgm_bench.envs.specs import DIRECTIONS, make_specs
@@ -35,6 +36,7 @@ class Simulation(TensorClass):
         steps: control steps since the reset, ``(num_envs,)`` int64.
         terminated: success or divergence, ``(num_envs,)`` bool.
         truncated: the horizon, ``(num_envs,)`` bool.
+        difficulty: of the scene, from 0 to 1, the task's own, ``(num_envs,)`` float32.
     """
 
     rod: RodState
@@ -45,6 +47,7 @@ class Simulation(TensorClass):
     steps: Tensor
     terminated: Tensor
     truncated: Tensor
+    difficulty: Tensor
 
 
 class SoftArmEnv(EnvBase):
@@ -89,6 +92,7 @@ class SoftArmEnv(EnvBase):
         self.horizon = config.horizon if horizon is None else horizon
         self.n_agents: int = config.n_agents
         self.n_slots: int = config.slots if task.max_cylinders else 0
+        self.n_privileged: int = task.n_privileged
         self.stagger = stagger
         self._dtype = dtype
         self._actuation = Actuation(
@@ -110,8 +114,11 @@ class SoftArmEnv(EnvBase):
         self._n_bins = task.max_cylinders * n_bins
         self._generator = torch.Generator(device=self.device)
         self._generator.manual_seed(seed)
-        for name, spec in make_specs(num_envs, self.n_agents, self.n_slots, self.device).items():
+        curriculum = config.curriculum.enabled
+        specs = make_specs(num_envs, self.n_agents, self.n_slots, self.n_privileged, curriculum, self.device)
+        for name, spec in specs.items():
             setattr(self, name, spec)
+        self._progress: Progress | None = first_progress(num_envs, self.device) if curriculum else None
         self._simulation, _ = self._fresh(num_envs)
 
     # TorchRL's contract
@@ -126,6 +133,8 @@ class SoftArmEnv(EnvBase):
             self._simulation, _ = self._fresh(self.batch_size[0])
             if self.stagger:
                 self._simulation.steps.random_(0, self.horizon, generator=self._generator)
+            if self._progress is not None:
+                self._progress.counting.fill_(not self.stagger)  # what is cut short says nothing about its scene
         else:
             self._begin_again(mask.reshape(-1))
         return self._first_frame(self._simulation, self._look(self._simulation))
@@ -174,6 +183,9 @@ class SoftArmEnv(EnvBase):
         success = (distance < config.success_radius) & ~broken
         simulation.terminated = terminated = terminated | (active & (success | broken))
         simulation.truncated = truncated | (active & (steps >= self.horizon) & ~terminated)
+        if self._progress is not None:
+            ended = active & (terminated | simulation.truncated)
+            self._progress = note_ends(self._progress, ended, success, config.curriculum)
         touching = self._count_contacts(simulation)
         terms = reward_terms(
             config.reward,
@@ -196,7 +208,8 @@ class SoftArmEnv(EnvBase):
     def _fresh(self, count: int) -> tuple[Simulation, Sight]:
         """Episodes at their beginning, scenes drawn from the own generator, and what is seen there."""
         config = self.task.config
-        scene = self.task.sample(count, self._generator).apply(self._real)
+        level = None if self._progress is None else difficulty(self._progress, config.curriculum)
+        scene = self.task.sample(count, self._generator, level).apply(self._real)
         bins = cut_into_bins(scene.cylinders, config.bin_length, self.task.max_cylinder_length)
         never = torch.zeros(count, dtype=torch.bool, device=self.device)
         simulation = Simulation(
@@ -208,6 +221,7 @@ class SoftArmEnv(EnvBase):
             steps=torch.zeros(count, dtype=torch.int64, device=self.device),
             terminated=never,
             truncated=never.clone(),
+            difficulty=torch.ones(count, device=self.device) * (1.0 if level is None else level),
             batch_size=[count],
         )
         sight = self._look(simulation)
@@ -221,6 +235,8 @@ class SoftArmEnv(EnvBase):
             The replaced rows, and new episodes for these; on a device that must not be waited for, None, and new
             episodes for all rows, of which those in ``mask`` are used.
         """
+        if self._progress is not None:
+            self._progress.counting.logical_or_(mask)
         if dense(self.device):
             fresh, sight = self._fresh(len(mask))
             self._simulation = fresh.where(mask, self._simulation)
@@ -294,6 +310,8 @@ class SoftArmEnv(EnvBase):
         self, simulation: Simulation, sight: Sight, numbers: Mapping[Key, Tensor], success: Tensor, broken: Tensor
     ) -> TensorDict:
         """Everything that a step or a reset writes, in tensors of its own."""
+        if self._progress is not None:
+            numbers = {**numbers, keys.DIFFICULTY: simulation.difficulty}
         rod = simulation.rod
         terminated, truncated = simulation.terminated.unsqueeze(-1), simulation.truncated.unsqueeze(-1)
         position = rod.position
@@ -315,6 +333,8 @@ class SoftArmEnv(EnvBase):
             "truncated": truncated.clone(),
             "done": terminated | truncated,
         }
+        if self.n_privileged:
+            root[keys.PRIVILEGED] = _float32(simulation.scene.privileged)
         for key, column in zip(numbers, _columns(*numbers.values()), strict=True):
             (root if isinstance(key, str) else entries[key[0]])[key if isinstance(key, str) else key[1]] = column
         batch = list(simulation.batch_size)
@@ -335,12 +355,17 @@ class SoftArmEnv(EnvBase):
         self._generator.set_state(state)
 
     def simulation_state(self) -> TensorDict:
-        """A copy of all episodes as they stand."""
-        return self._simulation.clone().to_tensordict()
+        """A copy of all episodes as they stand and, if there is one, of the curriculum."""
+        state = self._simulation.clone().to_tensordict()
+        if self._progress is not None:
+            state["curriculum"] = self._progress.clone().to_tensordict()
+        return state
 
     def load_simulation_state(self, state: TensorDictBase) -> None:
         """Go on from what ``simulation_state`` returned for as many environments of the same task."""
-        self._simulation.update_(state)
+        self._simulation.update_(state.exclude("curriculum"))
+        if self._progress is not None:
+            self._progress.update_(state["curriculum"])
 
 
 def _put(new: TensorDictBase, into: TensorDictBase, merged: Callable[[Tensor, Tensor], Tensor]) -> None:

@@ -20,8 +20,13 @@ INFO = (
 )
 
 
-def make_specs(num_envs: int, n_agents: int, n_slots: int, device: torch.device) -> dict[str, Composite]:
-    """Specs by the name of the ``EnvBase`` attribute, each with the batch dimension."""
+def make_specs(
+    num_envs: int, n_agents: int, n_slots: int, n_privileged: int, curriculum: bool, device: torch.device
+) -> dict[str, Composite]:
+    """Specs by the name of the ``EnvBase`` attribute, each with the batch dimension.
+
+    Without privileged numbers or without a curriculum, their entries are absent.
+    """
 
     def real(*shape: int) -> Unbounded:
         return Unbounded(shape=(num_envs, *shape), dtype=torch.float32, device=device)
@@ -39,14 +44,17 @@ def make_specs(num_envs: int, n_agents: int, n_slots: int, device: torch.device)
         "previous_action": action.clone(),
         "edge": flag(n_agents, n_slots),
     }
+    info = (*INFO, keys.DIFFICULTY) if curriculum else INFO
     observation = {
         "agents": group(agents, n_agents),
         "slots": group({"descriptor": real(n_slots, 9), "active": flag(n_slots)}, n_slots),
         "tip": real(3),
         "target": real(3),
-        "info": group({key[1]: flag(1) if key in (keys.SUCCESS, keys.DIVERGED) else real(1) for key in INFO}),
+        "info": group({key[1]: flag(1) if key in (keys.SUCCESS, keys.DIVERGED) else real(1) for key in info}),
         "reward_terms": group({name: real(1) for name in keys.REWARD_TERM_NAMES}),
     }
+    if n_privileged:
+        observation[keys.PRIVILEGED] = real(n_privileged)
     return {
         "observation_spec": group(observation),
         "action_spec": group({"agents": group({"action": action}, n_agents)}),

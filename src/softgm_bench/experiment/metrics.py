@@ -89,6 +89,8 @@ def step_metrics(batch: TensorDictBase) -> dict[str, float]:
         "torque_per_agent": after[keys.TORQUE_PER_AGENT],
         "torque_joint": after[keys.TORQUE_JOINT],
     }
+    if keys.DIFFICULTY in after.keys(include_nested=True):
+        means["difficulty"] = after[keys.DIFFICULTY]
     row = {name: value.double().mean().item() for name, value in means.items()}
     row["dropped_bins"] = after[keys.DROPPED].max().item()
     return row

@@ -1,7 +1,7 @@
 """What a task is: a configuration, and scenes drawn for any number of environments at once."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, ClassVar
@@ -16,6 +16,7 @@ from softgm_bench.rod.state import Cylinders
 POOL = 4096  # fewest values among which admissible ones are looked for where nobody may count them
 
 Range = tuple[float, float]
+Bounds = Sequence[float | Tensor]  # of two: numbers, or tensors without dimensions
 
 
 @dataclass
@@ -44,6 +45,35 @@ class ActuationConfig:
 
 
 @dataclass
+class CurriculumConfig:
+    """How training may begin with easier scenes; values and their meaning in ``conf/task/curriculum``.
+
+    Tasks add the scenes' easiest ranges; ``softgm_bench.envs.curriculum`` moves between them and the task's own.
+    """
+
+    enabled: bool
+    stages: int
+    episodes: int
+    promote: float
+    demote: float
+
+    def __post_init__(self) -> None:
+        """Refuse values by which nothing could be decided.
+
+        Raises:
+            ValueError: with one line naming the key, its value and what would be right.
+        """
+        for name in ("stages", "episodes"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"task.curriculum.{name} is {getattr(self, name)}: it must be at least 1")
+        if not 0.0 <= self.demote < self.promote < 1.0:
+            raise ValueError(
+                f"task.curriculum.demote is {self.demote}, task.curriculum.promote {self.promote}: "
+                "the first must be the smaller one, both at least 0 and below 1"
+            )
+
+
+@dataclass
 class TaskConfig:
     """What every task has; values and their meaning in ``conf/task``."""
 
@@ -58,6 +88,7 @@ class TaskConfig:
     slots: int
     actuation: ActuationConfig
     reward: RewardConfig
+    curriculum: CurriculumConfig
 
     def __post_init__(self) -> None:
         """Refuse values that describe no task.
@@ -84,10 +115,12 @@ class Scene(TensorClass):
     Attributes:
         target: m, ``(num_envs, 3)``.
         cylinders: the obstacles, padded to the task's ``max_cylinders``.
+        privileged: what describes the scene and must be found out by interaction, ``(num_envs, n_privileged)``.
     """
 
     target: Tensor
     cylinders: Cylinders
+    privileged: Tensor
 
 
 class Task(ABC):
@@ -98,29 +131,48 @@ class Task(ABC):
     Attributes:
         max_cylinders: the number that scenes are padded to.
         max_cylinder_length: the longest cylinder of any scene, m; 0 where there is none.
+        n_privileged: numbers in a scene's ``privileged``.
     """
 
     config_class: ClassVar[type[TaskConfig]]
     max_cylinders: int = 0
     max_cylinder_length: float = 0.0
+    n_privileged: int = 0
 
     def __init__(self, config: Any) -> None:
         """Keep the configuration."""
         self.config = config
 
     @abstractmethod
-    def sample(self, count: int, generator: torch.Generator) -> Scene:
-        """Draw ``count`` scenes, float64, on the generator's device."""
+    def sample(self, count: int, generator: torch.Generator, difficulty: Tensor | None = None) -> Scene:
+        """Draw ``count`` scenes, float64, on the generator's device.
+
+        Args:
+            count: number of scenes.
+            generator: to draw from.
+            difficulty: from 0, easiest, to 1, float64 without dimensions on the generator's device; for
+                configurations with ``curriculum.enabled``. None and 1 give the same scenes from the same generator
+                state, bit by bit, which may differ in the number of masked cylinders behind the others.
+        """
 
 
-def uniform(count: int, bounds: Range, generator: torch.Generator) -> Tensor:
+def eased(easy: Sequence[float], own: Sequence[float], difficulty: Tensor | None) -> Bounds:
+    """Numbers of a scene at a difficulty: ``easy`` at 0, ``own`` at 1 or without one, on a straight line between."""
+    if difficulty is None:
+        return own
+    first, last = constant((tuple(easy), tuple(own)), difficulty.device)
+    # exact at both ends, where first + difficulty * (last - first) is not
+    return torch.lerp(first, last, difficulty).unbind(0)
+
+
+def uniform(count: int, bounds: Bounds, generator: torch.Generator) -> Tensor:
     """Draw from ``[low, high]``: ``(count,)`` float64."""
     low, high = bounds
     noise = torch.rand(count, generator=generator, device=generator.device, dtype=torch.float64)
     return low + (high - low) * noise
 
 
-def uniform_box(count: int, bounds: tuple[Range, Range, Range], generator: torch.Generator) -> Tensor:
+def uniform_box(count: int, bounds: tuple[Bounds, Bounds, Bounds], generator: torch.Generator) -> Tensor:
     """Draw points from a box: ``(count, 3)`` float64."""
     return torch.stack([uniform(count, axis, generator) for axis in bounds], dim=-1)
 

@@ -4,17 +4,28 @@ import math
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
 from softgm_bench.envs.tasks.base import (
+    CurriculumConfig,
     Range,
     Scene,
     Task,
     TaskConfig,
     constant,
+    eased,
     no_cylinders,
     redraw_until,
     uniform,
 )
+
+
+@dataclass
+class BasicCurriculumConfig(CurriculumConfig):
+    """Targets of the easiest scenes."""
+
+    easy_target_distance: Range
+    easy_target_polar_angle: Range
 
 
 @dataclass
@@ -25,6 +36,7 @@ class BasicConfig(TaskConfig):
     target_polar_angle: Range
     resting_tip: tuple[float, float, float]
     min_distance_to_resting_tip: float
+    curriculum: BasicCurriculumConfig
 
 
 class Basic(Task):
@@ -32,15 +44,17 @@ class Basic(Task):
 
     config_class = BasicConfig
 
-    def sample(self, count: int, generator: torch.Generator) -> Scene:
+    def sample(self, count: int, generator: torch.Generator, difficulty: Tensor | None = None) -> Scene:
         """Draw ``count`` scenes."""
         c = self.config
         device = generator.device
         tip = constant(tuple(c.resting_tip), device)
+        distances = eased(c.curriculum.easy_target_distance, c.target_distance, difficulty)
+        polar_angles = eased(c.curriculum.easy_target_polar_angle, c.target_polar_angle, difficulty)
 
-        def draw(n: int) -> torch.Tensor:
-            distance = uniform(n, c.target_distance, generator)
-            polar = torch.deg2rad(uniform(n, c.target_polar_angle, generator))
+        def draw(n: int) -> Tensor:
+            distance = uniform(n, distances, generator)
+            polar = torch.deg2rad(uniform(n, polar_angles, generator))
             azimuth = uniform(n, (0.0, 2.0 * math.pi), generator)
             direction = torch.stack(
                 [polar.sin() * azimuth.cos(), polar.sin() * azimuth.sin(), polar.cos()],
@@ -48,8 +62,9 @@ class Basic(Task):
             )
             return distance.unsqueeze(-1) * direction
 
-        def accept(target: torch.Tensor) -> torch.Tensor:
+        def accept(target: Tensor) -> Tensor:
             return (target - tip).norm(dim=-1) >= c.min_distance_to_resting_tip
 
         target = redraw_until(draw, accept, count, "target", device)
-        return Scene(target=target, cylinders=no_cylinders(count, device), batch_size=[count])
+        cylinders = no_cylinders(count, device)
+        return Scene(target=target, cylinders=cylinders, privileged=target[:, :0], batch_size=[count])

@@ -3,8 +3,28 @@
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
-from softgm_bench.envs.tasks.base import Range, Scene, Task, TaskConfig, constant, uniform_box, upright_cylinders
+from softgm_bench.envs.tasks.base import (
+    CurriculumConfig,
+    Range,
+    Scene,
+    Task,
+    TaskConfig,
+    constant,
+    eased,
+    uniform_box,
+    upright_cylinders,
+)
+
+
+@dataclass
+class StructuredCurriculumConfig(CurriculumConfig):
+    """Targets of the easiest scenes."""
+
+    easy_target_x: Range
+    easy_target_y: Range
+    easy_target_z: Range
 
 
 @dataclass
@@ -18,6 +38,7 @@ class StructuredConfig(TaskConfig):
     target_x: Range
     target_y: Range
     target_z: Range
+    curriculum: StructuredCurriculumConfig
 
 
 class Structured(Task):
@@ -31,12 +52,17 @@ class Structured(Task):
         super().__init__(config)
         self.max_cylinder_length = config.post_z[1] - config.post_z[0]
 
-    def sample(self, count: int, generator: torch.Generator) -> Scene:
+    def sample(self, count: int, generator: torch.Generator, difficulty: Tensor | None = None) -> Scene:
         """Draw ``count`` scenes."""
-        c = self.config
+        c, easy = self.config, self.config.curriculum
         xy = constant(((c.post_x, -c.post_y), (c.post_x, c.post_y)), generator.device).expand(count, 2, 2)
         bottom = torch.full_like(xy[..., 0], c.post_z[0])
         top = torch.full_like(bottom, c.post_z[1])
         posts = upright_cylinders(xy, bottom, top, c.post_radius, torch.ones_like(bottom, dtype=torch.bool))
-        target = uniform_box(count, (c.target_x, c.target_y, c.target_z), generator)
-        return Scene(target=target, cylinders=posts, batch_size=[count])
+        box = (
+            eased(easy.easy_target_x, c.target_x, difficulty),
+            eased(easy.easy_target_y, c.target_y, difficulty),
+            eased(easy.easy_target_z, c.target_z, difficulty),
+        )
+        target = uniform_box(count, box, generator)
+        return Scene(target=target, cylinders=posts, privileged=target[:, :0], batch_size=[count])

@@ -1,0 +1,76 @@
+"""A curriculum over a task's scenes, gated by success; for training environments only.
+
+Difficulty rises in ``stages`` equal steps from 0, the easiest scenes, to 1, the task's own. All environments of one
+object share the stage. It moves after a round, in which every environment counts its first episodes of that round and
+no others: a window over the episodes that end first would hold the quick ones, which are successes.
+
+A round can end in any step, and nothing here looks at values: see ``softgm_bench.rod.dense``.
+"""
+
+import torch
+from tensordict import TensorClass
+from torch import Tensor
+
+from softgm_bench.envs.tasks.base import CurriculumConfig
+
+
+class Progress(TensorClass):
+    """Where a curriculum stands; ``batch_size`` is ``(num_envs,)``.
+
+    Attributes:
+        stage: from 0 to ``stages``, ``(num_envs,)`` int64; the same everywhere.
+        counting: the episode under way began in this round, ``(num_envs,)`` bool.
+        counted: episodes of this round, ``(num_envs,)`` int64.
+        succeeded: how many of these were successes, ``(num_envs,)`` int64.
+    """
+
+    stage: Tensor
+    counting: Tensor
+    counted: Tensor
+    succeeded: Tensor
+
+
+def first_progress(num_envs: int, device: torch.device) -> Progress:
+    """The easiest stage, before any episode has begun."""
+    zero = torch.zeros(num_envs, dtype=torch.int64, device=device)
+    return Progress(
+        stage=zero,
+        counting=torch.zeros(num_envs, dtype=torch.bool, device=device),
+        counted=zero.clone(),
+        succeeded=zero.clone(),
+        batch_size=[num_envs],
+    )
+
+
+def difficulty(progress: Progress, config: CurriculumConfig) -> Tensor:
+    """Of the scenes to be drawn now: from 0 to exactly 1, float64 without dimensions."""
+    return progress.stage[0].to(torch.float64) / config.stages
+
+
+def note_ends(progress: Progress, ended: Tensor, success: Tensor, config: CurriculumConfig) -> Progress:
+    """Count the episodes that have just ended and, when that completes the round, decide on the stage.
+
+    A round has at least ``episodes`` episodes, equally many of every environment. The stage rises by one if a larger
+    share of them than ``promote`` were successes, and falls by one if a smaller share than ``demote`` were.
+
+    Args:
+        progress: not changed.
+        ended: ``(num_envs,)`` bool.
+        success: of those that ended, ``(num_envs,)`` bool; anything elsewhere.
+        config: thresholds.
+    """
+    quota = -(-config.episodes // len(ended))
+    counts = ended & progress.counting & (progress.counted < quota)
+    counted = progress.counted + counts
+    succeeded = progress.succeeded + (counts & success)
+    complete = (counted >= quota).all()
+    share = succeeded.sum().to(torch.float64) / (quota * len(ended))
+    change = (complete & (share > config.promote)).long() - (complete & (share < config.demote)).long()
+    return Progress(
+        stage=(progress.stage + change).clamp(0, config.stages),
+        # what is under way when a round begins has lasted long already: more often a failure than not
+        counting=progress.counting & ~complete,
+        counted=counted * ~complete,
+        succeeded=succeeded * ~complete,
+        batch_size=progress.batch_size,
+    )
