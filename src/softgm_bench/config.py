@@ -19,6 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 from softgm_bench.rod.parameters import RodParameters
 
 DTYPES = ("float64", "float32")
+OBSERVATIONS = ("standard", "oracle")
 
 
 class UserError(Exception):
@@ -65,6 +66,7 @@ class Config:
     """
 
     seed: int
+    observation: str
     device: str
     backend: str | None
     dtype: str
@@ -77,6 +79,24 @@ class Config:
     rod: RodParameters
     experiment: ExperimentConfig
 
+    @property
+    def oracle(self) -> bool:
+        """Whether actors are told what they would have to discover: an upper bound, not a competitor."""
+        return self.observation == "oracle"
+
+    @property
+    def label(self) -> str:
+        """The algorithm's name as results carry it."""
+        return labelled(self.algo.name, self.observation)
+
+
+def labelled(algo: str, observation: str) -> str:
+    """``algo``, and whatever in the observation makes its results another kind's."""
+    return algo if observation == "standard" else f"{algo}_{observation}"
+
+
+# For conf/config.yaml: the run folder's name.
+OmegaConf.register_new_resolver("labelled", labelled, replace=True)
 
 # The arm's YAML is written by its dataclass, so that its values stand in one place.
 ConfigStore.instance().store(group="rod", name="paper", node=asdict(RodParameters()))
@@ -134,8 +154,9 @@ def plain(config: Config) -> dict[str, Any]:
     """The configuration as plain values; ``typed(OmegaConf.create(plain(config)))`` gives it back."""
     values = asdict(config)
     for group, schemas in _group_schemas().items():
-        names = {schema: name for name, schema in schemas.items()}
-        values[group] = {"name": names[type(getattr(config, group))]} | values[group]
+        if "name" not in values[group]:  # a model's: its type says it
+            (name,) = (name for name, schema in schemas.items() if schema is type(getattr(config, group)))
+            values[group] = {"name": name} | values[group]
     return values
 
 
@@ -166,6 +187,10 @@ def validate(config: Config) -> None:
             raise UserError(f"{key}={value}: it must be at least 1")
     if not config.run_dir:
         raise UserError("run_dir is empty: name a folder for the run")
+    if config.observation not in OBSERVATIONS:
+        raise UserError(f"observation={config.observation}: choose one of {', '.join(OBSERVATIONS)}")
+    if config.oracle and "oracle" not in config.run_dir:
+        raise UserError(f"run_dir={config.run_dir} with observation=oracle: put the word oracle into the folder's name")
     _validate_machine(config)
     _validate_by_building(config)
 
@@ -225,6 +250,7 @@ def _validate_by_building(config: Config) -> None:
             device=config.device,
             backend=config.backend,
             dtype=dtype_of(config),
+            curriculum=True,
         )
         build_encoder(config.model, env.n_agents, env.n_slots)
     except ValueError as error:
@@ -233,11 +259,11 @@ def _validate_by_building(config: Config) -> None:
 
 def _group_schemas() -> dict[str, dict[str, type]]:
     """Dataclass of every task, algorithm and model by name; imported late because it brings torch along."""
-    from softgm_bench.algorithms.ppo import PPOConfig
+    from softgm_bench.algorithms import algorithm_configs
     from softgm_bench.envs.tasks import TASK_CONFIGS
     from softgm_bench.models.registry import model_configs
 
-    return {"task": TASK_CONFIGS, "algo": {"softgm": PPOConfig}, "model": model_configs()}
+    return {"task": TASK_CONFIGS, "algo": algorithm_configs(), "model": model_configs()}
 
 
 def _schema(cls: type) -> DictConfig:

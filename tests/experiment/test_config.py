@@ -7,6 +7,7 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from softgm_bench.algorithms import algorithm_configs
 from softgm_bench.config import UserError, compose, compose_untyped, config_directory, dtype_of, plain, typed
 from softgm_bench.envs import make_env
 from softgm_bench.envs.tasks import TASK_CONFIGS
@@ -33,6 +34,80 @@ def test_every_combination_of_files_is_valid(task, experiment):
     assert config.run_dir == f"outputs/{task}/softgm/seed3"
 
 
+@pytest.mark.parametrize("recipe", ["paper", "open"])
+@pytest.mark.parametrize("algo", algorithm_configs())
+def test_every_algorithm_has_both_recipes(algo, recipe):
+    config = compose([f"algo={algo}", f"recipe={recipe}", "task=wall"])
+
+    assert type(config.algo) is algorithm_configs()[algo]
+    assert config.algo.name == algo
+    assert config.run_dir == f"outputs/wall/{algo}/seed0"
+    assert config.algo.gamma == {"paper": 0.99, "open": 0.95}[recipe]
+    assert config.model.velocity_scale == {"paper": 1.0, "open": 0.2}[recipe]
+
+
+def test_what_the_command_line_says_comes_after_the_recipe_and_the_recipe_after_the_experiment():
+    overrides = ["algo=masac", "experiment=quick", "recipe=open"]
+    assert (
+        compose(overrides).experiment.steps_per_batch
+        == compose(["algo=masac", "recipe=open"]).experiment.steps_per_batch
+    )
+    assert compose([*overrides, "experiment.steps_per_batch=7", "algo.gamma=0.9"]).experiment.steps_per_batch == 7
+    assert compose([*overrides, "algo.gamma=0.9"]).algo.gamma == 0.9
+
+
+def test_softgm_is_ppo_with_the_papers_settings():
+    config = compose([])
+    algo, model = config.algo, config.model
+    assert (algo.name, algo.centralised, algo.critic.pooling, algo.critic.asymmetric) == ("softgm", True, "mean", False)
+    assert (algo.clip_epsilon, algo.gamma, algo.gae_lambda, algo.entropy_coeff) == (0.2, 0.99, 0.95, 0.05)
+    assert (algo.max_grad_norm, algo.actor_lr, algo.critic_lr) == (0.5, 1e-4, 3e-4)
+    assert (algo.value_norm_decay, algo.lr_schedule, algo.target_kl, algo.advantage_clip) == (
+        None,
+        "constant",
+        None,
+        None,
+    )
+    assert not algo.actor.state_dependent_sigma
+    assert (model.hidden, model.heads, model.layers, model.type_embedding) == (128, 4, 2, 8)
+    assert model.stage1
+    assert model.stage2
+
+
+def test_ablations_are_softgm_but_for_their_stage():
+    softgm = plain(compose([]))
+    for stage in (1, 2):
+        ablated = plain(compose([f"algo=softgm_no_stage{stage}"]))
+        assert ablated["model"] == softgm["model"] | {f"stage{stage}": False}
+        assert ablated["algo"] == softgm["algo"] | {"name": f"softgm_no_stage{stage}"}
+
+
+def test_ippo_and_mappo_differ_from_softgm_in_model_and_critic_alone():
+    softgm = plain(compose([]))["algo"]
+    for name, changes in (("ippo", {"centralised": False}), ("mappo", {"critic": {"pooling": "concat"}})):
+        config = compose([f"algo={name}"])
+        critic = softgm["critic"] | changes.pop("critic", {})
+        assert plain(config)["algo"] == softgm | {"name": name, "critic": critic} | changes
+        assert type(config.model).__name__ == "MLPConfig"
+
+
+def test_a_linear_schedule_lasts_as_long_as_the_run_unless_told_otherwise():
+    assert compose(["experiment.total_frames=777"]).algo.lr_schedule_frames == 777
+    assert compose(["algo.lr_schedule_frames=5"]).algo.lr_schedule_frames == 5
+    refused = "algo.lr_schedule_frames is 0: it must be at least 1"
+    assert refusal("algo.lr_schedule=linear", "algo.lr_schedule_frames=0") == refused
+
+
+def test_an_oracle_says_so_wherever_its_results_go():
+    assert compose(["observation=oracle", "algo=ippo"]).run_dir == "outputs/basic/ippo_oracle/seed0"
+    assert compose(["observation=oracle", "algo=ippo"]).label == "ippo_oracle"
+    assert compose(["observation=oracle", "run_dir=here/oracle"]).oracle
+    assert refusal("observation=oracle", "run_dir=here").startswith(
+        "run_dir=here with observation=oracle: put the word"
+    )
+    assert not compose([]).oracle
+
+
 def test_the_arm_is_its_dataclass_unless_told_otherwise():
     assert compose([]).rod == RodParameters()
     assert compose(["rod.gravity=[0,0,-9.81]"]).rod == RodParameters(gravity=(0.0, 0.0, -9.81))
@@ -44,8 +119,9 @@ def test_a_model_can_be_chosen_against_the_algorithms_own():
     assert type(compose(["model=mlp"]).model).__name__ == "MLPConfig"
 
 
-def test_plain_values_give_the_same_configuration_back():
-    config = compose(["task=wall", "model=mlp"])
+@pytest.mark.parametrize("algo", algorithm_configs())
+def test_plain_values_give_the_same_configuration_back(algo):
+    config = compose(["task=wall_narrow", f"algo={algo}"])
 
     assert typed(OmegaConf.create(yaml.safe_load(yaml.safe_dump(plain_lists(plain(config)))))) == config
 
@@ -56,9 +132,11 @@ def plain_lists(value):
     return [plain_lists(item) for item in value] if isinstance(value, tuple) else value
 
 
-def test_dataclasses_carry_no_values_of_their_own_but_the_arms():
-    config = compose([])
+@pytest.mark.parametrize("algo", ["softgm", "iddpg", "isac"])
+def test_dataclasses_carry_no_values_of_their_own_but_the_arms(algo):
+    config = compose([f"algo={algo}"])
     parts = (config, config.experiment, config.experiment.evaluation, config.task, config.algo, config.model)
+    parts += (config.algo.actor, config.algo.critic)
     for part in parts:
         fields = dataclasses.fields(part)
         assert all(field.default is field.default_factory is dataclasses.MISSING for field in fields), type(part)
@@ -84,6 +162,9 @@ def test_unknown_choices_list_the_known_ones():
     assert refusal("task=wal") == f"task=wal: no such task; choose one of {tasks}"
     assert refusal("experiment=fast") == "experiment=fast: no such experiment; choose one of default, quick, smoke"
     assert refusal("model=cnn") == "model=cnn: no such model; choose one of mlp, softgm"
+    algorithms = ", ".join(sorted(algorithm_configs()))
+    assert refusal("algo=ppo") == f"algo=ppo: no such algo; choose one of {algorithms}"
+    assert refusal("recipe=best") == "recipe=best: no such recipe; choose one of open, paper"
     assert refusal("task=common").startswith("task=common: no such task; choose one of basic, ")
 
 
@@ -116,11 +197,15 @@ def test_unknown_choices_list_the_known_ones():
         "task.min_dilatation=1.5",
         "task.actuation.basis=linear",
         "task.actuation.scaling=total",
+        "observation=all",
         "algo.epochs=0",
         "algo.minibatch_size=0",
         "algo.gamma=1.5",
         "algo.actor_lr=0.0",
         "algo.entropy_coeff=-1.0",
+        "algo.lr_schedule=cosine",
+        "algo.value_norm_decay=1.0",
+        "algo.critic.pooling=max",
         "algo.actor.initial_sigma=9.0",
         "algo.actor.persistence=1.0",
     ],

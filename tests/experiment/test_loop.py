@@ -57,7 +57,13 @@ def test_a_finished_run_holds_what_its_settings_promise(tmp_path):
     summary = train(compose([*TINY, f"run_dir={tmp_path}", "task=structured", "experiment.total_frames=33"]))
 
     assert summary == json.loads((tmp_path / "summary.json").read_text())
-    assert (summary["task"], summary["algo"], summary["seed"]) == ("structured", "softgm", 0)
+    assert (summary["task"], summary["algo"], summary["model"], summary["seed"]) == (
+        "structured",
+        "softgm",
+        "softgm",
+        0,
+    )
+    assert summary["observation"] == "standard"
     assert summary["frames"] == 48  # whole iterations of 4 x 4
     assert summary["threads"] == 1
     assert summary["final_evaluation"]["episodes"] == 5
@@ -77,6 +83,26 @@ def test_every_task_trains_under_both_recipes(tmp_path, task, recipe):
     rows = trained(tmp_path, f"task={task}", f"recipe={recipe}", "model.hidden=16")
     assert len(rows) == 3
     assert all(float(row["loss_critic"]) == float(row["loss_critic"]) for row in rows)  # no NaN
+
+
+@pytest.mark.parametrize("algo", ["ippo", "masac"])
+def test_an_oracles_results_cannot_be_taken_for_anything_else(tmp_path, capsys, algo):
+    folder = tmp_path / "oracle"
+    sizes = TINY[:-2] if algo == "masac" else TINY
+    train(compose([*sizes, f"run_dir={folder}", "task=wall", "observation=oracle", f"algo={algo}"]))
+
+    summary = json.loads((folder / "summary.json").read_text())
+    assert (summary["algo"], summary["observation"]) == (f"{algo}_oracle", "oracle")
+    printed = capsys.readouterr()
+    assert f"{algo}_oracle on wall, seed 0" in printed.out
+    assert printed.err.count("frames (oracle): success") == 3
+
+
+def test_settings_that_only_the_algorithm_can_refuse_are_one_line_and_leave_nothing_behind(tmp_path):
+    small = ("algo=isac", "algo.batch_size=4", "algo.replay_capacity=7")
+    with pytest.raises(UserError, match=r"^algo\.replay_capacity is 7: it must be at least two frames[^\n]*$"):
+        train(compose([*TINY[:-2], f"run_dir={tmp_path / 'run'}", *small]))
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_checkpoint_holds_what_going_on_needs(tmp_path):
@@ -110,3 +136,9 @@ def test_derived_seeds_share_nothing_and_repeat():
 
 def test_threads_are_set_everywhere():
     assert set_threads(1) == torch.get_num_threads() == numba.get_num_threads() == 1
+
+
+def test_a_curriculum_is_followed_in_training_and_shown(tmp_path):
+    rows = trained(tmp_path, "task=wall", "task.curriculum.enabled=true")
+    assert all(float(row["difficulty"]) == 0.0 for row in rows)  # too short to be promoted
+    assert "difficulty" not in trained(tmp_path / "without", "task=wall")[0]

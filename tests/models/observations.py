@@ -65,8 +65,9 @@ def actor_config(**changes):
     return ActorConfig(**(values | changes))
 
 
-def value_config():
-    return ValueConfig(widths=[8])
+def value_config(**changes):
+    values = {"widths": [8], "pooling": "mean", "asymmetric": False}
+    return ValueConfig(**(values | changes))
 
 
 def randomise(module):

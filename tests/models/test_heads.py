@@ -4,8 +4,8 @@ from observations import actor_config, observation, randomise, softgm_config, va
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from softgm_bench.envs import keys
-from softgm_bench.models import MLPConfig, build_actor, build_value
-from softgm_bench.models.heads import LOC, SCALE, STATE_VALUE
+from softgm_bench.models import MLPConfig, build_actor, build_value, graph
+from softgm_bench.models.heads import LOC, POOLINGS, SCALE, STATE_VALUE
 
 ENCODERS = pytest.mark.parametrize(
     "encoder", [softgm_config(), MLPConfig(hidden=8, layers=2, velocity_scale=1.0)], ids=["softgm", "mlp"]
@@ -25,8 +25,11 @@ def test_shapes(encoder, lead):
     assert td[keys.LOG_PROB].shape == (*lead, 4)
     assert td[LOC].shape == td[SCALE].shape == (*lead, 4, 2)
     assert (td[keys.ACTION].abs() <= 1).all()
-    value = build_value(encoder, 4, 6, value_config())
-    assert value(td)[STATE_VALUE].shape == (*lead, 1)
+    for pooling in POOLINGS:
+        value = build_value(encoder, 4, 6, value_config(pooling=pooling))
+        assert value(td)[STATE_VALUE].shape == (*lead, 1)
+    value = build_value(encoder, 4, 6, value_config(), centralised=False)
+    assert value(td)[STATE_VALUE].shape == (*lead, 4, 1)
 
 
 @ENCODERS
@@ -112,6 +115,71 @@ def test_the_value_pools_the_agents_mean():
     value = build_value(softgm_config(), 4, 6, value_config())
     expected = value.function(value.encoder(td).mean(dim=-2))
     assert torch.equal(value(td)[STATE_VALUE], expected)
+
+
+def test_the_concatenated_value_reads_every_agents_node_and_embedding_side_by_side():
+    td = observation((5,))
+    value = build_value(softgm_config(), 4, 6, value_config(pooling="concat"))
+    parts = [graph.agent_channels(td), value.encoder(td)]
+    agents = [torch.cat([part[:, agent] for part in parts], dim=-1) for agent in range(4)]
+    assert torch.equal(value(td)[STATE_VALUE], value.function(torch.cat(agents, dim=-1)))
+
+
+@ENCODERS
+@pytest.mark.parametrize("pooling", POOLINGS)
+def test_a_centralised_critic_sees_every_agent(encoder, pooling):
+    torch.manual_seed(0)
+    value = randomise(build_value(encoder, 4, 6, value_config(pooling=pooling)))
+    for agent in range(4):
+        td = observation((5,))
+        before = value(td.clone())[STATE_VALUE]
+        td[keys.AGENT_VELOCITY][:, agent] += 1.0
+        assert not torch.isclose(before, value(td)[STATE_VALUE]).any()
+
+
+OWN = (keys.AGENT_POSITION, keys.AGENT_VELOCITY, keys.PREVIOUS_ACTION, keys.EDGE)
+
+
+@pytest.mark.parametrize("moved", range(4))
+@pytest.mark.parametrize("entry", OWN)
+def test_an_independent_critic_sees_of_each_agent_what_its_actor_sees(entry, moved):
+    """The MLP's agents see their own entries, SoftGM's (here one layer) also what their neighbours tell them."""
+    for encoder, reach in ((MLPConfig(hidden=8, layers=2, velocity_scale=1.0), 0), (softgm_config(layers=1), 1)):
+        torch.manual_seed(0)
+        value = randomise(build_value(encoder, 4, 6, value_config(), centralised=False)).double()
+        td = observation((5,), sensed=0.6, discovered=1.0, dtype=torch.float64)
+        other = td.clone()
+        other[entry][:, moved] = ~td[entry][:, moved] if entry == keys.EDGE else td[entry][:, moved] + 1.0
+        difference = (value(td)[STATE_VALUE] - value(other)[STATE_VALUE]).abs().squeeze(-1)
+        changed = (difference > 1e-12).any(dim=0).tolist()
+        assert changed == [abs(agent - moved) <= reach for agent in range(4)]
+
+
+def test_privileged_channels_enter_the_heads_that_are_built_for_them_and_no_other():
+    torch.manual_seed(0)
+    td = observation((5,))
+    td[keys.PRIVILEGED] = torch.randn(5, 3)
+    other = td.clone()
+    other[keys.PRIVILEGED] = td[keys.PRIVILEGED] + 1.0
+
+    def same(build, key):
+        network = randomise(build)
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            return torch.equal(network(td.clone())[key], network(other.clone())[key])
+
+    for known in (0, 3):
+        network = build_actor(softgm_config(), 4, 6, actor_config(), n_privileged=known)
+        assert (keys.PRIVILEGED in network.in_keys) is bool(known)
+        assert same(network, LOC) is not bool(known)
+        for centralised, pooling in ((True, "mean"), (True, "concat"), (False, "mean")):
+            value = build_value(softgm_config(), 4, 6, value_config(pooling=pooling), centralised, known)
+            assert (keys.PRIVILEGED in value.in_keys) is bool(known)
+            assert same(value, STATE_VALUE) is not bool(known)
+
+
+def test_an_unknown_pooling_is_refused():
+    with pytest.raises(ValueError, match=r"algo\.critic\.pooling is max: choose one of mean, concat"):
+        value_config(pooling="max")
 
 
 def test_actor_and_critic_share_no_parameter():

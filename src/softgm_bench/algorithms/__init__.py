@@ -1,1 +1,19 @@
-"""Algorithms: how a batch of frames improves a model."""
+"""Algorithms: how a batch of frames improves a model. One class each for PPO, DDPG and SAC, known by several names."""
+
+from softgm_bench.algorithms.ddpg import DDPG, DDPGConfig
+from softgm_bench.algorithms.ppo import PPO, PPOConfig
+from softgm_bench.algorithms.registry import Algorithm, algorithm_configs, build_algorithm, register_algorithm
+from softgm_bench.algorithms.sac import SAC, SACConfig
+
+__all__ = [
+    "DDPG",
+    "PPO",
+    "SAC",
+    "Algorithm",
+    "DDPGConfig",
+    "PPOConfig",
+    "SACConfig",
+    "algorithm_configs",
+    "build_algorithm",
+    "register_algorithm",
+]

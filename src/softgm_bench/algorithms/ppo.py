@@ -1,29 +1,36 @@
-"""Proximal policy optimisation for a team: one reward and one state value, one probability ratio per agent."""
+"""Proximal policy optimisation for a team: one reward, one probability ratio per agent.
+
+SoftGM and MAPPO have a centralised critic, one value of the state; IPPO an independent one, a value per agent of what
+that agent observes. Actors and, in IPPO, critics share their parameters among agents.
+"""
 
 from dataclasses import dataclass
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.modules.value_norm import PopArtValueNorm
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
+from softgm_bench.algorithms.registry import register_algorithm
+from softgm_bench.algorithms.team import give_to_agents
 from softgm_bench.envs import SoftArmEnv, keys
 from softgm_bench.models.heads import STATE_VALUE, ActorConfig, ValueConfig, build_actor, build_value
 
 ADVANTAGE, VALUE_TARGET = "advantage", "value_target"
-# What an update reads of a frame; everything else stays out of the minibatches.
-TRAINED_ON = (*keys.OBSERVATION, keys.ACTION, keys.LOG_PROB, ADVANTAGE, VALUE_TARGET)
 REPORTED = ("loss_objective", "loss_critic", "loss_entropy", "entropy", "kl_approx", "clip_fraction")
 LR_MARGIN, LR_FACTOR = 1.5, 1.2  # of the actor's learning rate's adaptation to ``target_kl``
+LR_SCHEDULES = ("constant", "linear")
 
 
 @dataclass
 class PPOConfig:
-    """Hyperparameters; values and meaning in ``conf/algo/softgm.yaml``."""
+    """Hyperparameters; values and meaning in ``conf/algo/common/ppo.yaml``."""
 
     name: str
+    centralised: bool
     clip_epsilon: float
     gamma: float
     gae_lambda: float
@@ -32,11 +39,14 @@ class PPOConfig:
     max_grad_norm: float
     actor_lr: float
     critic_lr: float
+    lr_schedule: str
+    lr_schedule_frames: int
     target_kl: float | None
     epochs: int
     minibatch_size: int
     normalize_advantage: bool
     advantage_clip: float | None
+    value_norm_decay: float | None
     actor: ActorConfig
     critic: ValueConfig
 
@@ -62,23 +72,39 @@ class PPOConfig:
         for name in ("entropy_coeff", "critic_coeff"):
             if not getattr(self, name) >= 0.0:
                 raise ValueError(f"algo.{name} is {getattr(self, name)}: it must not be negative")
+        if self.lr_schedule not in LR_SCHEDULES:
+            raise ValueError(f"algo.lr_schedule is {self.lr_schedule}: choose one of {', '.join(LR_SCHEDULES)}")
+        if self.lr_schedule != "constant" and self.lr_schedule_frames < 1:
+            raise ValueError(f"algo.lr_schedule_frames is {self.lr_schedule_frames}: it must be at least 1")
+        if self.value_norm_decay is not None and not 0.0 <= self.value_norm_decay < 1.0:
+            raise ValueError(
+                f"algo.value_norm_decay is {self.value_norm_decay}: it must be at least 0 and below 1, or null"
+            )
 
 
+@register_algorithm("softgm", "softgm_no_stage1", "softgm_no_stage2", "ippo", "mappo", config=PPOConfig)
 class PPO:
     """TorchRL's ``ClipPPOLoss`` and ``GAE`` with an optimiser each for actor and critic.
 
     Attributes:
         policy: what the collector and the evaluation call; shares its parameters with the loss.
+        trained_frames: how many frames the updates so far have learnt from.
     """
 
-    def __init__(self, config: PPOConfig, model_config: Any, env: SoftArmEnv) -> None:
-        """Build networks, loss and optimisers for an environment's sizes and device."""
+    def __init__(self, config: PPOConfig, model_config: Any, env: SoftArmEnv, oracle: bool = False) -> None:
+        """Build networks, loss and optimisers for an environment's sizes and device.
+
+        An asymmetric critic, and actor and critic of an oracle, read ``keys.PRIVILEGED``.
+        """
         self.config = config
-        self.policy = build_actor(model_config, env.n_agents, env.n_slots, config.actor).to(env.device)
-        value = build_value(model_config, env.n_agents, env.n_slots, config.critic).to(env.device)
+        sizes = (model_config, env.n_agents, env.n_slots)
+        known_to_actor = env.n_privileged if oracle else 0
+        known_to_critic = env.n_privileged if oracle or config.critic.asymmetric else 0
+        self.policy = build_actor(*sizes, config.actor, known_to_actor).to(env.device)
+        self.critic = build_value(*sizes, config.critic, config.centralised, known_to_critic).to(env.device)
         self.loss = ClipPPOLoss(
             self.policy,
-            value,
+            self.critic,
             clip_epsilon=config.clip_epsilon,
             entropy_coeff=config.entropy_coeff,
             critic_coeff=config.critic_coeff,
@@ -86,14 +112,19 @@ class PPO:
             normalize_advantage=False,  # done once an iteration, over all of its frames
         )
         self.loss.set_keys(action=keys.ACTION, sample_log_prob=keys.LOG_PROB, value=STATE_VALUE)
-        # vmap over (now, next) would forbid the encoder's data-dependent shapes
-        self.advantage = GAE(
-            gamma=config.gamma, lmbda=config.gae_lambda, value_network=value, deactivate_vmap=True, average_gae=False
-        )
+        self.advantage = GAE(gamma=config.gamma, lmbda=config.gae_lambda, value_network=None, average_gae=False)
+        self.value_norm: PopArtValueNorm | None = None
+        if config.value_norm_decay is not None:
+            self.value_norm = PopArtValueNorm(beta=config.value_norm_decay, device=env.device)
+        # What an update reads of a frame; everything else stays out of the minibatches.
+        read = dict.fromkeys((*self.policy.in_keys, *self.critic.in_keys))
+        self._trained_on = (*read, keys.ACTION, keys.LOG_PROB, ADVANTAGE, VALUE_TARGET)
         self._actor_parameters = list(self.policy.parameters())
-        self._critic_parameters = list(value.parameters())
+        self._critic_parameters = list(self.critic.parameters())
         self.actor_optimizer = torch.optim.Adam(self._actor_parameters, lr=config.actor_lr, eps=1e-5)
         self.critic_optimizer = torch.optim.Adam(self._critic_parameters, lr=config.critic_lr, eps=1e-5)
+        self.trained_frames = 0
+        self._kl_scale = 1.0  # of the actor's learning rate
 
     def update(self, batch: TensorDictBase) -> dict[str, float]:
         """Improve actor and critic on fresh frames.
@@ -102,7 +133,8 @@ class PPO:
             batch: ``(num_envs, steps)`` consecutive frames of the current policy.
 
         Returns:
-            Means over all minibatches of losses, entropy, KL divergence, clip fraction and gradient norms.
+            Means over all minibatches of losses, entropy, KL divergence, clip fraction and gradient norms; the learning
+            rates that the next update begins with.
         """
         frames = self.prepare(batch)
         totals, counts = zip(*(self._epoch(frames) for _ in range(self.config.epochs)), strict=True)
@@ -113,19 +145,20 @@ class PPO:
             {name: value / count for name, value in zip(names, values, strict=True)}
             for values, count in zip(read, counts, strict=True)
         ]
-        if self.config.target_kl is not None:
-            self._adapt_actor_lr(epochs[-1]["kl_approx"], self.config.target_kl)
+        self.trained_frames += batch.numel()
+        self._set_learning_rates(epochs[-1]["kl_approx"])
         means = {name: sum(epoch[name] for epoch in epochs) / len(epochs) for name in names}
-        return means | {"actor_lr": self.actor_optimizer.param_groups[0]["lr"]}
+        optimizers = {"actor_lr": self.actor_optimizer, "critic_lr": self.critic_optimizer}
+        return means | {name: optimizer.param_groups[0]["lr"] for name, optimizer in optimizers.items()}
 
     def prepare(self, batch: TensorDictBase) -> TensorDictBase:
         """Estimate advantages and value targets, and flatten to frames ``(num_envs * steps,)``.
 
-        The team's advantage is given to every agent, ``(frames, N, 1)``: here and nowhere else.
+        Advantages are every agent's, ``(frames, N, 1)``. Value targets have the shape of the critic's values, and with
+        value normalisation their scale.
         """
-        with torch.no_grad():
-            batch = self.advantage(batch)
-        frames = batch.select(*TRAINED_ON).reshape(-1)
+        n_agents = batch.get(keys.LOG_PROB).shape[-1]
+        frames = self._estimate(batch, n_agents).select(*self._trained_on).reshape(-1)
         advantage = frames.get(ADVANTAGE)
         if self.config.normalize_advantage:
             advantage = _standardised(advantage)
@@ -135,8 +168,31 @@ class PPO:
             advantage = advantage.clamp(-limit, limit)
             if self.config.normalize_advantage:
                 advantage = _standardised(advantage)
-        n_agents = frames.get(keys.LOG_PROB).shape[-1]
-        return frames.set(ADVANTAGE, advantage.unsqueeze(-2).expand(-1, n_agents, 1))
+        return frames.set(ADVANTAGE, give_to_agents(advantage, n_agents) if self.config.centralised else advantage)
+
+    @torch.no_grad()
+    def _estimate(self, batch: TensorDictBase, n_agents: int) -> TensorDictBase:
+        """Add ``ADVANTAGE`` and ``VALUE_TARGET`` to a copy of the batch, of the team or (independent) of each agent."""
+        after = batch.get("next")
+        outcome = after.select(keys.REWARD, keys.DONE, keys.TERMINATED)
+        if not self.config.centralised:
+            outcome = outcome.apply(lambda of_team: give_to_agents(of_team, n_agents))
+        estimates = self.advantage(
+            TensorDict(
+                {STATE_VALUE: self._values(batch), "next": outcome.set(STATE_VALUE, self._values(after))},
+                batch.batch_size,
+            )
+        )
+        target = estimates.get(VALUE_TARGET)
+        if self.value_norm is not None:
+            self.value_norm.update(target)
+            target = self.value_norm.normalize(target)
+        return batch.copy().set(ADVANTAGE, estimates.get(ADVANTAGE)).set(VALUE_TARGET, target)
+
+    def _values(self, td: TensorDictBase) -> Tensor:
+        """The critic's values in the reward's scale."""
+        value = self.critic(td.select(*self.critic.in_keys)).get(STATE_VALUE)
+        return value if self.value_norm is None else self.value_norm.denormalize(value)
 
     def _epoch(self, frames: TensorDictBase) -> tuple[dict[str, Tensor], int]:
         """Pass once over all frames in random minibatches; sums over the minibatches, and how many there were."""
@@ -150,17 +206,28 @@ class PPO:
                 count += 1
         return totals, count
 
-    def _adapt_actor_lr(self, kl: float, target: float) -> None:
-        """Keep the policy's change per update near ``target``, the mean KL divergence over the last epoch.
+    def _set_learning_rates(self, kl: float) -> None:
+        """Learning rates of the next update: the settings, times what is left of a linear schedule's frames.
 
-        With a constant step the change grows as sigma shrinks, until updates undo each other. ``actor_lr`` is the
-        upper bound: above it, learning was slower even where the divergence was small.
+        The actor's is also scaled so that the policy's change per update stays near ``target_kl``, held against ``kl``,
+        the mean KL divergence over the last epoch. With a constant step the change grows as sigma shrinks, until
+        updates undo each other. ``actor_lr`` is the upper bound: above it, learning was slower even where the
+        divergence was small.
         """
-        for group in self.actor_optimizer.param_groups:
-            if kl > LR_MARGIN * target:
-                group["lr"] /= LR_FACTOR
-            elif kl < target / LR_MARGIN:
-                group["lr"] = min(group["lr"] * LR_FACTOR, self.config.actor_lr)
+        config = self.config
+        if config.target_kl is not None and kl > LR_MARGIN * config.target_kl:
+            self._kl_scale /= LR_FACTOR
+        elif config.target_kl is not None and kl < config.target_kl / LR_MARGIN:
+            self._kl_scale = min(self._kl_scale * LR_FACTOR, 1.0)
+        left = 1.0
+        if config.lr_schedule == "linear":
+            left = max(0.0, 1.0 - self.trained_frames / config.lr_schedule_frames)
+        for optimizer, lr in (
+            (self.actor_optimizer, config.actor_lr * self._kl_scale),
+            (self.critic_optimizer, config.critic_lr),
+        ):
+            for group in optimizer.param_groups:
+                group["lr"] = lr * left
 
     def _step(self, minibatch: TensorDictBase) -> dict[str, Tensor]:
         losses = self.loss(minibatch)
@@ -177,11 +244,14 @@ class PPO:
         return metrics | {"actor_grad_norm": actor_norm.detach(), "critic_grad_norm": critic_norm.detach()}
 
     def state_dict(self) -> dict[str, Any]:
-        """Networks and optimisers."""
+        """Networks, optimisers, statistics of the value targets and where the schedules are."""
         return {
             "loss": self.loss.state_dict(),
             "actor_optimizer": self.actor_optimizer.state_dict(),
             "critic_optimizer": self.critic_optimizer.state_dict(),
+            "value_norm": None if self.value_norm is None else self.value_norm.state_dict(),
+            "trained_frames": self.trained_frames,
+            "kl_scale": self._kl_scale,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -189,6 +259,9 @@ class PPO:
         self.loss.load_state_dict(state["loss"])
         self.actor_optimizer.load_state_dict(state["actor_optimizer"])
         self.critic_optimizer.load_state_dict(state["critic_optimizer"])
+        if self.value_norm is not None:
+            self.value_norm.load_state_dict(state["value_norm"])
+        self.trained_frames, self._kl_scale = state["trained_frames"], state["kl_scale"]
 
 
 def _standardised(values: Tensor) -> Tensor:

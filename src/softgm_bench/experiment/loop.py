@@ -13,7 +13,7 @@ from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 from torchrl.envs.utils import ExplorationType
 
-from softgm_bench.algorithms.ppo import PPO
+from softgm_bench.algorithms import Algorithm, build_algorithm
 from softgm_bench.config import Config, UserError, available_threads, dtype_of, plain
 from softgm_bench.envs import SoftArmEnv, make_env
 from softgm_bench.experiment import checkpoint, run_folder
@@ -47,7 +47,7 @@ class Run:
     folder: RunFolder
     seeds: Seeds
     env: SoftArmEnv
-    algorithm: PPO
+    algorithm: Algorithm
     episodes: EpisodeTracker
     started: float
     iteration: int = 0
@@ -110,17 +110,20 @@ def set_threads(threads: int | None) -> int:
 
 def _begin(config: Config) -> Run:
     started = time.perf_counter()
-    folder = run_folder.create(config.run_dir, plain(config), config.overwrite)
     seeds = derive_seeds(config.seed)
     set_threads(config.threads)
     torch.manual_seed(seeds.torch)
     experiment = config.experiment
-    env = _make_env(config, experiment.num_envs, seeds.training, experiment.train_horizon, stagger=True)
-    algorithm = PPO(config.algo, config.model, env)
+    env = _make_env(config, experiment.num_envs, seeds.training, experiment.train_horizon, training=True)
+    try:
+        algorithm = build_algorithm(config.algo, config.model, env, config.oracle)
+    except ValueError as error:  # settings that do not fit together
+        raise UserError(str(error)) from error
+    folder = run_folder.create(config.run_dir, plain(config), config.overwrite)
     return Run(config, folder, seeds, env, algorithm, EpisodeTracker(experiment.num_envs, config.device), started)
 
 
-def _make_env(config: Config, num_envs: int, seed: int, horizon: int | None, stagger: bool = False) -> SoftArmEnv:
+def _make_env(config: Config, num_envs: int, seed: int, horizon: int | None, training: bool = False) -> SoftArmEnv:
     return make_env(
         config.task,
         config.rod,
@@ -130,7 +133,8 @@ def _make_env(config: Config, num_envs: int, seed: int, horizon: int | None, sta
         device=config.device,
         backend=config.backend,
         dtype=dtype_of(config),
-        stagger=stagger,
+        stagger=training,
+        curriculum=training,
     )
 
 
@@ -211,7 +215,8 @@ def _evaluate_in_training(run: Run, interruption: Interruption, progress: Progre
     with run.folder.evaluations.open("a") as file:
         file.write(run_folder.to_json(at | metrics) + "\n")
     success, length = metrics["success_rate"]["mean"], metrics["episode_length"]["mean"]
-    progress.say(f"evaluation after {run.frames} frames: success {success:.2f}, {length:.1f} steps an episode")
+    oracle = " (oracle)" if run.config.oracle else ""
+    progress.say(f"evaluation after {run.frames} frames{oracle}: success {success:.2f}, {length:.1f} steps an episode")
 
 
 def _save(run: Run) -> Path:
@@ -238,7 +243,9 @@ def _finish(run: Run, records: EpisodeRecords) -> dict[str, Any]:
     metrics = summarise(records)
     summary = {
         "task": config.task.name,
-        "algo": config.algo.name,
+        "algo": config.label,
+        "model": plain(config)["model"]["name"],
+        "observation": config.observation,
         "seed": config.seed,
         "frames": run.frames,
         "wall_time": run.wall_time,
@@ -249,6 +256,6 @@ def _finish(run: Run, records: EpisodeRecords) -> dict[str, Any]:
         "versions": versions(),
     }
     run_folder.write_atomically(run.folder.summary, (run_folder.to_json(summary, indent=2) + "\n").encode())
-    print(table(metrics, f"{config.algo.name} on {config.task.name}, seed {config.seed}, {run.frames} frames:"))
+    print(table(metrics, f"{config.label} on {config.task.name}, seed {config.seed}, {run.frames} frames:"))
     print(f"run folder: {run.folder.path}")
     return summary

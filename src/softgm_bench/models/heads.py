@@ -1,16 +1,18 @@
 """From embeddings to TorchRL actors and critics; the same heads for every encoder.
 
-Each network reads ``keys.OBSERVATION`` from the tensordict itself: an encoder and its head cost one module call.
+Each network reads ``keys.OBSERVATION`` from the tensordict itself: an encoder and its head cost one module call. A head
+that is built with ``n_privileged`` above 0 reads that many channels of ``keys.PRIVILEGED`` too: an asymmetric critic's
+or an oracle's. No encoder ever does.
 """
 
 import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import (
     InteractionType,
     ProbabilisticTensorDictModule,
@@ -27,7 +29,8 @@ from softgm_bench.models.registry import Encoder, build_encoder
 ACTIONS = 2  # normal and binormal
 LOC = ("agents", "loc")  # (B, N, 2), before the bound
 SCALE = ("agents", "scale")  # (B, N, 2)
-STATE_VALUE = "state_value"  # (B, 1)
+STATE_VALUE = "state_value"  # (B, 1) of a centralised critic, (B, N, 1) of an independent one
+POOLINGS = ("mean", "concat")
 
 
 @dataclass
@@ -76,9 +79,28 @@ class ValueConfig:
 
     Attributes:
         widths: hidden layers, each followed by tanh.
+        pooling: what a centralised critic makes of N agents. ``mean``: the mean of their embeddings g_i, the paper's;
+            ``concat``: [o_i || g_i] of all agents side by side, MAPPO's. An independent critic pools nothing.
+        asymmetric: the head reads ``keys.PRIVILEGED`` too. Only training has a critic, so execution does not need it.
     """
 
     widths: list[int]
+    pooling: str
+    asymmetric: bool
+
+    def __post_init__(self) -> None:
+        """Refuse values that give no critic.
+
+        Raises:
+            ValueError: with one line naming the key, its value and what would be right.
+        """
+        if self.pooling not in POOLINGS:
+            raise ValueError(f"algo.critic.pooling is {self.pooling}: choose one of {', '.join(POOLINGS)}")
+
+
+def input_keys(n_privileged: int) -> list[NestedKey]:
+    """Entries that a network with ``n_privileged`` privileged channels reads."""
+    return [*keys.OBSERVATION, keys.PRIVILEGED] if n_privileged else list(keys.OBSERVATION)
 
 
 def feedforward(in_features: int, widths: Sequence[int], out_features: int, last_gain: float) -> nn.Sequential:
@@ -94,31 +116,39 @@ def feedforward(in_features: int, widths: Sequence[int], out_features: int, last
 
 
 class AgentHead(nn.Module):
-    """``f([o_i || g_i])`` for every agent with shared parameters; o_i is the agent's own node (15 channels)."""
+    """``f([o_i || g_i])`` for every agent with shared parameters; o_i is the agent's own node (15 channels).
 
-    def __init__(self, encoder: Encoder, widths: Sequence[int], out_features: int, last_gain: float) -> None:
+    With privileged channels w it is ``f([o_i || g_i || w])``.
+    """
+
+    def __init__(
+        self, encoder: Encoder, widths: Sequence[int], out_features: int, last_gain: float, n_privileged: int = 0
+    ) -> None:
         """Put f (hidden layers ``widths``, last layer scaled by ``last_gain``) on an encoder, which gives g_i."""
         super().__init__()
         self.encoder = encoder
-        self.function = feedforward(graph.CHANNELS + self.encoder.out_features, widths, out_features, last_gain)
+        self.n_privileged = n_privileged
+        in_features = graph.CHANNELS + encoder.out_features + n_privileged
+        self.function = feedforward(in_features, widths, out_features, last_gain)
 
     def forward(self, td: TensorDictBase) -> Tensor:
         """``(..., N, out_features)``."""
-        own = graph.agent_channels(td, self.encoder.velocity_scale)
-        return self.function(torch.cat([own, self.encoder(td)], dim=-1))
+        parts = [graph.agent_channels(td, self.encoder.velocity_scale), self.encoder(td)]
+        if self.n_privileged:
+            known = td.get(keys.PRIVILEGED).unsqueeze(-2)
+            parts.append(known.expand(*parts[0].shape[:-1], self.n_privileged))
+        return self.function(torch.cat(parts, dim=-1))
 
 
 class GaussianPolicy(TensorDictModuleBase):
     """Writes the pre-tanh mean ``LOC`` and standard deviation ``SCALE`` of every agent's action, ``(..., N, 2)``."""
 
-    in_keys: ClassVar = list(keys.OBSERVATION)
-    out_keys: ClassVar = [LOC, SCALE]
-
-    def __init__(self, encoder: Encoder, config: ActorConfig) -> None:
+    def __init__(self, encoder: Encoder, config: ActorConfig, n_privileged: int = 0) -> None:
         """Put the policy's head on an encoder."""
         super().__init__()
+        self.in_keys, self.out_keys = input_keys(n_privileged), [LOC, SCALE]
         outputs = 2 * ACTIONS if config.state_dependent_sigma else ACTIONS
-        self.head = AgentHead(encoder, config.widths, outputs, last_gain=0.01)
+        self.head = AgentHead(encoder, config.widths, outputs, last_gain=0.01, n_privileged=n_privileged)
         self.persistence = config.persistence
         self.low, self.range = math.log(config.min_sigma), math.log(config.max_sigma / config.min_sigma)
         fraction = torch.tensor((math.log(config.initial_sigma) - self.low) / self.range)
@@ -144,20 +174,46 @@ class GaussianPolicy(TensorDictModuleBase):
 
 
 class TeamValue(TensorDictModuleBase):
-    """Writes V(s) = f_V(mean over agents of g_i), ``(..., 1)`` (section "Distributed Control Policy")."""
+    """A centralised critic: writes one value of the state, ``(..., 1)``.
 
-    in_keys: ClassVar = list(keys.OBSERVATION)
-    out_keys: ClassVar = [STATE_VALUE]
+    Pooling ``mean``: V(s) = f_V(mean over agents of g_i) (section "Distributed Control Policy"). Pooling ``concat``:
+    V(s) = f_V([o_1 || g_1 || .. || o_N || g_N]), MAPPO's, whatever the encoder. Privileged channels follow last.
+    """
 
-    def __init__(self, encoder: Encoder, config: ValueConfig) -> None:
+    def __init__(self, encoder: Encoder, config: ValueConfig, n_agents: int, n_privileged: int = 0) -> None:
         """Put the critic's head on an encoder."""
         super().__init__()
-        self.encoder = encoder
-        self.function = feedforward(self.encoder.out_features, config.widths, 1, last_gain=1.0)
+        self.in_keys, self.out_keys = input_keys(n_privileged), [STATE_VALUE]
+        self.encoder, self.pooling, self.n_privileged = encoder, config.pooling, n_privileged
+        of_agent = encoder.out_features
+        pooled = of_agent if self.pooling == "mean" else n_agents * (graph.CHANNELS + of_agent)
+        self.function = feedforward(pooled + n_privileged, config.widths, 1, last_gain=1.0)
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write ``STATE_VALUE``."""
-        return td.set(STATE_VALUE, self.function(self.encoder(td).mean(dim=-2)))
+        embedding = self.encoder(td)
+        if self.pooling == "mean":
+            pooled = embedding.mean(dim=-2)
+        else:
+            own = graph.agent_channels(td, self.encoder.velocity_scale)
+            pooled = torch.cat([own, embedding], dim=-1).flatten(-2)
+        if self.n_privileged:
+            pooled = torch.cat([pooled, td.get(keys.PRIVILEGED)], dim=-1)
+        return td.set(STATE_VALUE, self.function(pooled))
+
+
+class AgentValue(TensorDictModuleBase):
+    """An independent critic with shared parameters: writes a value per agent, ``(..., N, 1)``, of [o_i || g_i]."""
+
+    def __init__(self, encoder: Encoder, config: ValueConfig, n_privileged: int = 0) -> None:
+        """Put the critic's head on an encoder."""
+        super().__init__()
+        self.in_keys, self.out_keys = input_keys(n_privileged), [STATE_VALUE]
+        self.head = AgentHead(encoder, config.widths, 1, last_gain=1.0, n_privileged=n_privileged)
+
+    def forward(self, td: TensorDictBase) -> TensorDictBase:
+        """Write ``STATE_VALUE``."""
+        return td.set(STATE_VALUE, self.head(td))
 
 
 class SquashedNormal(TanhNormal):
@@ -167,7 +223,7 @@ class SquashedNormal(TanhNormal):
 
 
 def build_actor(
-    encoder_config: Any, n_agents: int, n_slots: int, config: ActorConfig
+    encoder_config: Any, n_agents: int, n_slots: int, config: ActorConfig, n_privileged: int = 0
 ) -> ProbabilisticTensorDictSequential:
     """The squashed Gaussian actor: reads ``keys.OBSERVATION``, writes ``keys.ACTION`` and ``keys.LOG_PROB`` (B, N).
 
@@ -176,7 +232,7 @@ def build_actor(
     that of the stored float32 action by 2 % at |z| = 6 and without limit beyond, so that PPO's ratio of an unchanged
     policy would not be one. Losses that need the exact pathwise sample (SAC) take it from ``get_dist``.
     """
-    policy = GaussianPolicy(build_encoder(encoder_config, n_agents, n_slots), config)
+    policy = GaussianPolicy(build_encoder(encoder_config, n_agents, n_slots), config, n_privileged)
     sample = ProbabilisticTensorDictModule(
         in_keys={"loc": LOC, "scale": SCALE},
         out_keys=[keys.ACTION],
@@ -189,6 +245,20 @@ def build_actor(
     return ProbabilisticTensorDictSequential(policy, sample)
 
 
-def build_value(encoder_config: Any, n_agents: int, n_slots: int, config: ValueConfig) -> TeamValue:
-    """The paper's critic with a graph network of its own: reads ``keys.OBSERVATION``, writes ``STATE_VALUE`` (B, 1)."""
-    return TeamValue(build_encoder(encoder_config, n_agents, n_slots), config)
+def build_value(
+    encoder_config: Any,
+    n_agents: int,
+    n_slots: int,
+    config: ValueConfig,
+    centralised: bool = True,
+    n_privileged: int = 0,
+) -> TeamValue | AgentValue:
+    """A critic with an encoder of its own: reads ``keys.OBSERVATION``, writes ``STATE_VALUE``.
+
+    A centralised critic says one value for the team, (B, 1); an independent one a value per agent, (B, N, 1), of what
+    that agent's actor reads. With ``n_privileged`` above 0 its head reads ``keys.PRIVILEGED`` too.
+    """
+    encoder = build_encoder(encoder_config, n_agents, n_slots)
+    if centralised:
+        return TeamValue(encoder, config, n_agents, n_privileged)
+    return AgentValue(encoder, config, n_privileged)

@@ -1,0 +1,118 @@
+"""Deep deterministic policy gradient for a team: IDDPG and, with a centralised critic, MADDPG.
+
+BenchMARL's semantics: one actor for all agents; in MADDPG's actor loss every action is the current policy's, so that
+the actor climbs the team's Q in all of them at once.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.objectives import DDPGLoss
+
+from softgm_bench.algorithms.off_policy import Explorer, OffPolicy, OffPolicyConfig
+from softgm_bench.algorithms.registry import register_algorithm
+from softgm_bench.envs import SoftArmEnv, keys
+from softgm_bench.models.action_value import ACTION_VALUE, build_action_value
+from softgm_bench.models.heads import ACTIONS, AgentHead, input_keys
+from softgm_bench.models.registry import Encoder, build_encoder
+
+
+@dataclass
+class DeterministicActorConfig:
+    """The policy's head. Values: ``conf/algo/iddpg.yaml``.
+
+    Attributes:
+        widths: hidden layers, each followed by tanh.
+    """
+
+    widths: list[int]
+
+
+@dataclass
+class DDPGConfig(OffPolicyConfig):
+    """Hyperparameters; values and meaning in ``conf/algo/iddpg.yaml``."""
+
+    target_actor: bool
+    initial_sigma: float
+    final_sigma: float
+    sigma_frames: int
+    noise_correlation: float
+    actor: DeterministicActorConfig
+
+
+class DeterministicPolicy(TensorDictModuleBase):
+    """Writes ``keys.ACTION`` = tanh(f([o_i || g_i])), ``(..., N, 2)``; parameters shared by all agents."""
+
+    def __init__(self, encoder: Encoder, config: DeterministicActorConfig, n_privileged: int = 0) -> None:
+        """Put the policy's head on an encoder."""
+        super().__init__()
+        self.in_keys, self.out_keys = input_keys(n_privileged), [keys.ACTION]
+        self.head = AgentHead(encoder, config.widths, ACTIONS, last_gain=0.01, n_privileged=n_privileged)
+
+    def forward(self, td: TensorDictBase) -> TensorDictBase:
+        """Write ``keys.ACTION``."""
+        return td.set(keys.ACTION, self.head(td).tanh())
+
+
+class NoisyExplorer(Explorer):
+    """Adds Gaussian noise that may be correlated in time, and cuts the action to [-1, 1].
+
+    With correlation rho and the standard deviation sigma, ``a_t = (1 - rho) mu_t + rho a_{t-1} + sqrt(1 - rho^2) sigma
+    xi_t``. While mu is constant, a_t - mu is the Ornstein-Uhlenbeck process in discrete time, whose standard deviation
+    is sigma whatever rho. It needs no memory, because the previous action is observed.
+
+    Attributes:
+        sigma: standard deviation of the noise.
+    """
+
+    def __init__(self, actor: TensorDictModuleBase, correlation: float) -> None:
+        """Explore around ``actor``."""
+        super().__init__(actor)
+        self.correlation = correlation
+        self.sigma = 0.0
+
+    def explore(self, action: Tensor, td: TensorDictBase) -> Tensor:
+        """The actor's action with noise."""
+        if self.correlation:
+            action = torch.lerp(action, td.get(keys.PREVIOUS_ACTION), self.correlation)
+        fresh = math.sqrt(1.0 - self.correlation**2) * self.sigma
+        return (action + fresh * torch.randn_like(action)).clamp(-1.0, 1.0)
+
+
+@register_algorithm("iddpg", "maddpg", config=DDPGConfig)
+class DDPG(OffPolicy):
+    """TorchRL's ``DDPGLoss``."""
+
+    policy: NoisyExplorer
+    reported = ("loss_actor", "loss_value", "q_mean", "target_mean")
+
+    def __init__(self, config: DDPGConfig, model_config: Any, env: SoftArmEnv, oracle: bool = False) -> None:
+        """Build networks, loss and optimisers for an environment's sizes and device.
+
+        An asymmetric critic, and actor and critic of an oracle, read ``keys.PRIVILEGED``.
+        """
+        sizes = (model_config, env.n_agents, env.n_slots)
+        known_to_actor = env.n_privileged if oracle else 0
+        known_to_critic = env.n_privileged if oracle or config.critic.asymmetric else 0
+        actor = DeterministicPolicy(build_encoder(*sizes), config.actor, known_to_actor).to(env.device)
+        critic = build_action_value(*sizes, config.critic, config.centralised, known_to_critic).to(env.device)
+        loss = DDPGLoss(actor, critic, loss_function="l2", delay_actor=config.target_actor, delay_value=True)
+        loss.set_keys(state_action_value=ACTION_VALUE)
+        super().__init__(config, env, NoisyExplorer(actor, config.noise_correlation), loss, known_to_critic)
+        self._optimize("actor", list(actor.parameters()), config.actor_lr)
+        self._optimize("critic", list(critic.parameters()), config.critic_lr)
+
+    def _schedule(self) -> None:
+        super()._schedule()
+        config = self.config
+        progress = min(1.0, self.frames / config.sigma_frames)
+        self.policy.sigma = config.initial_sigma + progress * (config.final_sigma - config.initial_sigma)
+
+    def _metrics(self, losses: TensorDictBase) -> list[Tensor]:
+        loss_actor = losses["loss_actor"]
+        return [loss_actor, losses["loss_value"], -loss_actor, losses["target_value"].mean()]

@@ -1,0 +1,249 @@
+"""What DDPG and SAC share: replay, exploration, and how many gradient steps follow a batch of frames."""
+
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.envs.utils import ExplorationType, exploration_type
+from torchrl.objectives import LossModule, SoftUpdate, ValueEstimators
+
+from softgm_bench.algorithms.replay import Replay
+from softgm_bench.algorithms.team import give_to_agents
+from softgm_bench.envs import SoftArmEnv, keys
+from softgm_bench.models.action_value import ActionValueConfig
+
+# The team's reward and end of episode, as TorchRL's losses read them: per agent, (B, N, 1).
+AGENT_REWARD, AGENT_DONE, AGENT_TERMINATED = ("agents", "reward"), ("agents", "done"), ("agents", "terminated")
+PRIORITY = ("agents", "td_error")  # written by the losses, read by nobody
+ADAM_EPSILON = 1e-6  # BenchMARL's
+
+
+@dataclass
+class OffPolicyConfig:
+    """Hyperparameters of every off-policy algorithm; values and meaning in ``conf/algo/iddpg.yaml``."""
+
+    name: str
+    centralised: bool
+    gamma: float
+    tau: float
+    batch_size: int
+    updates_per_frame: float
+    random_frames: int
+    replay_capacity: int
+    checkpoint_replay: bool
+    max_grad_norm: float
+    actor_lr: float
+    critic_lr: float
+    critic: ActionValueConfig
+
+    def __post_init__(self) -> None:
+        """Refuse values that the algorithm cannot work with.
+
+        Raises:
+            ValueError: with one line naming the key, its value and what would be right.
+        """
+        for field in fields(self):
+            value, wanted = getattr(self, field.name), BOUNDS.get(field.name)
+            if wanted is not None and value is not None and not wanted[0](value):
+                raise ValueError(f"algo.{field.name} is {value}: it must {wanted[1]}")
+        if self.replay_capacity < self.batch_size:
+            raise ValueError(
+                f"algo.replay_capacity is {self.replay_capacity}: it must be at least algo.batch_size {self.batch_size}"
+            )
+
+
+_AT_LEAST_ONE = (lambda value: value >= 1, "be at least 1")
+_ABOVE_ZERO = (lambda value: value > 0.0, "be above 0")
+_NOT_NEGATIVE = (lambda value: value >= 0.0, "not be negative")
+BOUNDS = {
+    "batch_size": _AT_LEAST_ONE,
+    "replay_capacity": _AT_LEAST_ONE,
+    "random_frames": _NOT_NEGATIVE,
+    "updates_per_frame": _ABOVE_ZERO,
+    "max_grad_norm": _ABOVE_ZERO,
+    "actor_lr": _ABOVE_ZERO,
+    "critic_lr": _ABOVE_ZERO,
+    "gamma": (lambda value: 0.0 <= value <= 1.0, "lie between 0 and 1"),
+    "tau": (lambda value: 0.0 < value <= 1.0, "be above 0 and at most 1"),
+    # DDPG's
+    "initial_sigma": _NOT_NEGATIVE,
+    "final_sigma": _NOT_NEGATIVE,
+    "sigma_frames": _AT_LEAST_ONE,
+    "noise_correlation": (lambda value: 0.0 <= value < 1.0, "be at least 0 and below 1"),
+    # SAC's
+    "alpha_lr": _ABOVE_ZERO,
+    "initial_alpha": _ABOVE_ZERO,
+}
+
+
+class Explorer(TensorDictModuleBase):
+    """The policy that the collector and the evaluation call.
+
+    Under ``ExplorationType.RANDOM`` it draws actions uniformly while ``uniform`` is set, and explores afterwards;
+    otherwise it does what ``actor`` does. It writes ``keys.ACTION`` alone, whatever else the actor writes.
+
+    Attributes:
+        uniform: draw from [-1, 1], regardless of the observation.
+    """
+
+    out_keys: ClassVar = [keys.ACTION]
+
+    def __init__(self, actor: TensorDictModuleBase) -> None:
+        """Explore around ``actor``, whose parameters are shared."""
+        super().__init__()
+        self.in_keys = list(actor.in_keys)
+        self.actor = actor
+        self.uniform = False
+
+    def forward(self, td: TensorDictBase) -> TensorDictBase:
+        """Write ``keys.ACTION``."""
+        explores = exploration_type() is ExplorationType.RANDOM
+        if explores and self.uniform:
+            return td.set(keys.ACTION, torch.empty_like(td.get(keys.PREVIOUS_ACTION)).uniform_(-1.0, 1.0))
+        action = self.actor(td.copy()).get(keys.ACTION)
+        return td.set(keys.ACTION, self.explore(action, td) if explores else action)
+
+    def explore(self, action: Tensor, td: TensorDictBase) -> Tensor:
+        """The action to take instead of the actor's; an actor that samples explores by itself."""
+        return action
+
+
+class OffPolicy:
+    """Stores frames, samples transitions, takes gradient steps; subclasses build networks and loss.
+
+    Attributes:
+        policy: what the collector and the evaluation call; shares its parameters with the loss.
+        loss: TorchRL's, with target networks; its entries that start with ``loss_`` are summed and minimised.
+        optimizers: by name, each with the parameters whose gradient norm is limited together.
+        frames: learnt from since the beginning.
+    """
+
+    reported: ClassVar[tuple[str, ...]]
+
+    def __init__(self, config: Any, env: SoftArmEnv, policy: Explorer, loss: LossModule, n_privileged: int) -> None:
+        """Finish what a subclass began.
+
+        Args:
+            config: an ``OffPolicyConfig`` of the subclass.
+            env: whose sizes the memory has.
+            policy: around the loss's actor.
+            loss: without the team's keys and value estimator, which are added here.
+            n_privileged: channels of ``keys.PRIVILEGED`` that some network reads.
+        """
+        self.config = config
+        self.policy, self.loss = policy, loss
+        self.n_agents = env.n_agents
+        loss.set_keys(reward=AGENT_REWARD, done=AGENT_DONE, terminated=AGENT_TERMINATED, priority=PRIORITY)
+        loss.make_value_estimator(ValueEstimators.TD0, gamma=config.gamma)
+        self.target_update = SoftUpdate(loss, tau=config.tau)
+        self.optimizers: dict[str, torch.optim.Optimizer] = {}
+        sizes = (env.batch_size[0], env.n_agents, env.n_slots)
+        self.replay = Replay(config.replay_capacity, *sizes, env.device, n_privileged)
+        self.frames = 0
+        self._due = 0.0  # gradient steps, of which whole ones are taken
+        self._schedule()
+
+    def update(self, batch: TensorDictBase) -> dict[str, float]:
+        """Store frames, then take ``updates_per_frame`` gradient steps for each of them.
+
+        Args:
+            batch: ``(num_envs, steps)`` consecutive frames.
+
+        Returns:
+            Means over the gradient steps of losses and gradient norms, NaN if none was taken; how many were taken, and
+            how many transitions can be sampled.
+        """
+        self.replay.add(batch)
+        self.frames += batch.numel()
+        steps = self._steps_for(batch.numel())
+        self._schedule()
+        totals = None
+        for _ in range(steps):
+            metrics = self._step(self.sample())
+            totals = metrics if totals is None else totals + metrics
+        # the only look at results: a GPU works through all steps without being waited for
+        values = [float("nan")] * len(self._names) if totals is None else (totals / steps).tolist()
+        return dict(zip(self._names, values, strict=True)) | {
+            "gradient_steps": float(steps),
+            "replay_size": float(len(self.replay)),
+        }
+
+    def sample(self) -> TensorDictBase:
+        """Transitions as the loss reads them: the team's reward and end of episode given to every agent."""
+        transitions = self.replay.sample(self.config.batch_size)
+        after = transitions["next"]
+        for of_team, of_agent in (
+            (keys.REWARD, AGENT_REWARD),
+            (keys.DONE, AGENT_DONE),
+            (keys.TERMINATED, AGENT_TERMINATED),
+        ):
+            after[of_agent] = give_to_agents(after[of_team], self.n_agents)
+        return transitions
+
+    def state_dict(self) -> dict[str, Any]:
+        """Networks, target networks, optimisers, counters, and the replay if ``checkpoint_replay`` says so."""
+        state = {
+            "loss": self.loss.state_dict(),
+            "optimizers": {name: optimizer.state_dict() for name, optimizer in self.optimizers.items()},
+            "frames": self.frames,
+            "due": self._due,
+        }
+        return state | ({"replay": self.replay.state_dict()} if self.config.checkpoint_replay else {})
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from what ``state_dict`` returned.
+
+        Without the replay, gradient steps pause until as many frames are stored again as before the very first one.
+        """
+        self.loss.load_state_dict(state["loss"])
+        for name, optimizer in self.optimizers.items():
+            optimizer.load_state_dict(state["optimizers"][name])
+        self.frames, self._due = state["frames"], state["due"]
+        if "replay" in state:
+            self.replay.load_state_dict(state["replay"])
+        self._schedule()
+
+    def _optimize(self, name: str, parameters: list[nn.Parameter], lr: float) -> None:
+        """Add an optimiser."""
+        self.optimizers[name] = torch.optim.Adam(parameters, lr=lr, eps=ADAM_EPSILON)
+
+    @property
+    def _names(self) -> list[str]:
+        """Of the metrics of a gradient step."""
+        return [*self.reported, *(f"{name}_grad_norm" for name in self.optimizers)]
+
+    def _steps_for(self, frames: int) -> int:
+        """Gradient steps that ``frames`` new frames make due; none before there is enough to sample from."""
+        config = self.config
+        if self.replay.stored < max(config.batch_size, config.random_frames):
+            return 0
+        self._due += frames * config.updates_per_frame
+        steps = int(self._due)
+        self._due -= steps
+        return steps
+
+    def _schedule(self) -> None:
+        """Set what depends on the number of frames."""
+        self.policy.uniform = self.frames < self.config.random_frames
+
+    def _step(self, transitions: TensorDictBase) -> Tensor:
+        """One gradient step of every network; metrics in the order of ``_names``."""
+        losses = self.loss(transitions)
+        total = sum(value for name, value in losses.items() if name.startswith("loss_"))
+        for optimizer in self.optimizers.values():
+            optimizer.zero_grad(set_to_none=True)
+        total.backward()
+        norms = []
+        for optimizer in self.optimizers.values():
+            parameters = optimizer.param_groups[0]["params"]
+            norms.append(nn.utils.clip_grad_norm_(parameters, self.config.max_grad_norm))
+            optimizer.step()
+        self.target_update.step()
+        return torch.stack([*(value.detach() for value in self._metrics(losses)), *norms])
+
+    def _metrics(self, losses: TensorDictBase) -> list[Tensor]:
+        """What ``reported`` names, from what the loss returned."""
+        raise NotImplementedError

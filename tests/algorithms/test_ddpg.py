@@ -1,0 +1,283 @@
+import dataclasses
+
+import pytest
+import torch
+from bandit import LEARNS_FAST, SIZES, error_after_learning
+from tensordict import TensorDict
+from torchrl.collectors import Collector
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from softgm_bench.algorithms.ddpg import DDPG, DDPGConfig
+from softgm_bench.algorithms.off_policy import AGENT_REWARD
+from softgm_bench.algorithms.registry import algorithm_configs
+from softgm_bench.envs import keys, make_env
+from softgm_bench.models.action_value import ACTION_VALUE
+from softgm_bench.models.mlp import MLPConfig
+from softgm_bench.rod.parameters import RodParameters
+
+SHORT = RodParameters(substeps=5)
+SMALL = ("algo.batch_size=16", "algo.replay_capacity=200", "algo.random_frames=0", "algo.updates_per_frame=0.1")
+
+
+@pytest.fixture(autouse=True)
+def _one_thread():
+    """These tensors are so small that a second thread would only be waited for."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture
+def build(settings):
+    def algorithm(name="iddpg", *overrides, task="basic", horizon=7):
+        config = settings(f"task={task}", f"algo={name}", *SMALL, *overrides)
+        torch.manual_seed(0)
+        env = make_env(config.task, SHORT, num_envs=4, seed=0, horizon=horizon)
+        return DDPG(config.algo, config.model, env), env
+
+    return algorithm
+
+
+def batches(algorithm, env, count=1, steps=8):
+    collector = Collector(
+        env,
+        algorithm.policy,
+        frames_per_batch=env.batch_size[0] * steps,
+        total_frames=count * env.batch_size[0] * steps,
+        exploration_type=ExplorationType.RANDOM,
+    )
+    yield from collector
+    collector.shutdown()
+
+
+def filled(algorithm, env):
+    (batch,) = batches(algorithm, env)
+    algorithm.replay.add(batch)
+    return algorithm
+
+
+def says(parameters, value):
+    """Make a network with these parameters say ``value`` whatever it reads: all zero but the last bias."""
+    leaves = [parameter.data for parameter in parameters]
+    for leaf in leaves:
+        leaf.zero_()
+    leaves[-1].fill_(value)
+
+
+def three_ends(algorithm):
+    """Rewards 1, 3, 5 in a frame that goes on, one that is truncated and one that is terminated."""
+    transitions = algorithm.sample()[:3]
+    column = (3, 1, 1)
+    for name, values in {
+        "reward": [1.0, 3.0, 5.0],
+        "done": [False, True, True],
+        "terminated": [False, False, True],
+    }.items():
+        transitions["next", "agents", name] = torch.tensor(values).view(column).expand(3, algorithm.n_agents, 1).clone()
+    return transitions
+
+
+@pytest.mark.parametrize("name", ["iddpg", "maddpg"])
+def test_targets_bootstrap_at_a_truncation_and_not_at_a_termination(build, name):
+    """Target critic 2, critic 0, discount 0.5, by hand: 1 + 1, 3 + 1, 5."""
+    algorithm = filled(*build(name, "algo.gamma=0.5"))
+    says(algorithm.loss.value_network_params.parameters(), 0.0)
+    says(algorithm.loss.target_value_network_params.values(True, True), 2.0)
+    losses = algorithm.loss(three_ends(algorithm))
+    assert losses["target_value"].T.tolist() == [[2.0, 4.0, 5.0]] * 6
+    assert losses["loss_value"].item() == pytest.approx((4 + 16 + 25) / 3)
+    assert losses["loss_actor"].item() == 0.0
+
+
+def test_the_target_network_follows_softly(build):
+    algorithm, _ = build("iddpg", "algo.tau=0.25", "algo.target_actor=true")
+    for name in ("value_network_params", "actor_network_params"):
+        sources = list(getattr(algorithm.loss, name).parameters())
+        targets = list(getattr(algorithm.loss, f"target_{name}").values(True, True))
+        assert all(torch.equal(*pair) for pair in zip(sources, targets, strict=True))
+        says(sources, 4.0)
+        says(targets, 0.0)
+        algorithm.target_update.step()
+        assert (targets[-1] == 1.0).all()  # 0 + (4 - 0) / 4
+        algorithm.target_update.step()
+        assert (targets[-1] == 1.75).all()  # 1 + (4 - 1) / 4
+        assert all((target == 0.0).all() for target in targets[:-1])
+
+
+@pytest.mark.parametrize("name", ["iddpg", "maddpg"])
+def test_the_actors_loss_asks_for_the_current_actions_of_all_agents(build, name):
+    algorithm = filled(*build(name))
+    transitions = algorithm.sample()
+    critic = algorithm.loss.value_network
+    with torch.no_grad(), algorithm.loss.value_network_params.to_module(critic):
+        current = algorithm.policy.actor(transitions.copy())
+        assert not torch.equal(current[keys.ACTION], transitions[keys.ACTION])
+        expected = -critic(current)[ACTION_VALUE].mean()
+    assert algorithm.loss(transitions)["loss_actor"].item() == pytest.approx(expected.item(), rel=1e-5)
+
+
+def test_the_teams_reward_is_every_agents(build):
+    transitions = filled(*build()).sample()
+    assert transitions["next", keys.REWARD].shape == (16, 1)
+    assert transitions["next", AGENT_REWARD].shape == (16, 6, 1)
+    assert (transitions["next", AGENT_REWARD] == transitions["next", keys.REWARD].unsqueeze(1)).all()
+    assert transitions["next", keys.REWARD].unique().numel() > 5
+
+
+def observe(env):
+    return env.reset().select(*keys.OBSERVATION)
+
+
+def actions(policy, td, exploration, count=1):
+    with torch.no_grad(), set_exploration_type(exploration):
+        return torch.stack([policy(td.clone())[keys.ACTION] for _ in range(count)])
+
+
+def test_noise_is_added_only_while_exploring_and_has_the_scheduled_sigma(build):
+    algorithm, env = build("iddpg", "algo.initial_sigma=0.4", "algo.final_sigma=0.1", "algo.sigma_frames=64")
+    td, policy = observe(env), algorithm.policy
+    mean = policy.actor(td.clone())[keys.ACTION]
+    assert mean.abs().max() < 0.1
+    for exploration in (ExplorationType.DETERMINISTIC, ExplorationType.MEAN):
+        assert torch.equal(actions(policy, td, exploration)[0], mean)
+    explored = actions(policy, td, ExplorationType.RANDOM, 400)
+    assert explored.abs().max() == 1.0  # cut
+    assert (explored - mean).abs().median().item() == pytest.approx(0.6745 * 0.4, rel=0.05)  # cutting moves no median
+    for batch, sigma in zip(batches(algorithm, env, count=3), (0.25, 0.1, 0.1), strict=True):
+        algorithm.update(batch)
+        assert policy.sigma == pytest.approx(sigma)
+    assert torch.equal(actions(policy, td, ExplorationType.DETERMINISTIC)[0], policy.actor(td.clone())[keys.ACTION])
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.8])
+def test_noise_has_the_same_sigma_whatever_its_correlation(build, correlation):
+    algorithm, env = build("iddpg", f"algo.noise_correlation={correlation}", "algo.initial_sigma=0.2")
+    says(algorithm.policy.actor.parameters(), 0.0)
+    td, taken = observe(env), []
+    torch.manual_seed(0)
+    for _ in range(600):
+        taken.append(actions(algorithm.policy, td, ExplorationType.RANDOM)[0])
+        td[keys.PREVIOUS_ACTION] = taken[-1]
+    noise = torch.stack(taken)[20:]
+    assert noise.std().item() == pytest.approx(0.2, rel=0.05)
+    lag_one = (noise[1:] * noise[:-1]).mean() / noise.square().mean()
+    assert lag_one.item() == pytest.approx(correlation, abs=0.03)
+
+
+def test_actions_are_uniform_and_nothing_is_learnt_during_the_random_frames(build):
+    algorithm, env = build("iddpg", "algo.random_frames=64", "algo.initial_sigma=0.01", "algo.final_sigma=0.01")
+    seen = []
+    for batch in batches(algorithm, env, count=3):
+        before = [parameter.clone() for parameter in algorithm.loss.parameters()]
+        metrics = algorithm.update(batch)
+        changed = any(not torch.equal(*pair) for pair in zip(before, algorithm.loss.parameters(), strict=True))
+        assert changed == (metrics["gradient_steps"] > 0)
+        seen.append((metrics["gradient_steps"], batch[keys.ACTION].std().item()))
+    assert [steps for steps, _ in seen] == [0.0, 3.0, 3.0]
+    assert [spread for _, spread in seen[:2]] == pytest.approx([3**-0.5] * 2, rel=0.1)
+    assert seen[2][1] < 0.1
+
+
+def test_gradient_steps_per_frame_may_be_a_fraction(build):
+    algorithm, env = build("iddpg", "algo.updates_per_frame=0.09")
+    taken = [algorithm.update(batch)["gradient_steps"] for batch in batches(algorithm, env, count=4)]
+    assert taken == [2.0, 3.0, 3.0, 3.0]  # of 2.88, 5.76, 8.64, 11.52
+
+
+@pytest.mark.parametrize("model", ["mlp", "softgm"])
+@pytest.mark.parametrize("name", ["iddpg", "maddpg"])
+def test_an_update_moves_actor_critic_and_target_on_every_model(build, name, model):
+    algorithm, env = build(name, f"model={model}", "model.hidden=16", "task.sensing_radius=0.4", task="wall")
+    loss = algorithm.loss
+    (batch,) = batches(algorithm, env)
+    assert batch[keys.EDGE].any()
+    groups = [loss.actor_network_params, loss.value_network_params, loss.target_value_network_params]
+    before = [group.clone() for group in groups]
+    metrics = algorithm.update(batch)
+    for old, new in zip(before, groups, strict=True):
+        moved = [not torch.equal(old[key], new[key]) for key in new.keys(True, True)]
+        assert sum(moved) > 0.9 * len(moved)
+    assert set(metrics) == {
+        *("loss_actor", "loss_value", "q_mean", "target_mean", "actor_grad_norm", "critic_grad_norm"),
+        *("gradient_steps", "replay_size"),
+    }
+    assert all(torch.tensor(value).isfinite() for value in metrics.values())
+    # the collector's policy is the loss's actor
+    assert {p.data_ptr() for p in algorithm.policy.parameters()} == {
+        p.data_ptr() for p in loss.actor_network_params.parameters()
+    }
+
+
+def test_an_algorithm_goes_on_bit_for_bit_from_its_saved_state(build):
+    algorithm, env = build("maddpg", "algo.checkpoint_replay=true")
+    first, second = batches(algorithm, env, count=2)
+    algorithm.update(first)
+    saved = copied(algorithm.state_dict())
+    other, _ = build("maddpg", "algo.checkpoint_replay=true")
+    other.load_state_dict(saved)
+
+    def proceed(one):
+        torch.manual_seed(5)
+        return one.update(second)
+
+    assert proceed(algorithm) == proceed(other)
+    assert other.policy.sigma == algorithm.policy.sigma
+
+
+def test_without_the_replay_an_algorithm_waits_for_new_frames(build):
+    algorithm, env = build("iddpg", "algo.random_frames=40")
+    one, two, three, four = batches(algorithm, env, count=4)
+    for batch in (one, two):
+        algorithm.update(batch)
+    state = algorithm.state_dict()
+    assert "replay" not in state
+    other, _ = build("iddpg", "algo.random_frames=40")
+    other.load_state_dict(state)
+    assert not other.policy.uniform
+    assert [other.update(batch)["gradient_steps"] for batch in (three, four)] == [0.0, 3.0]
+
+
+def copied(value):
+    if isinstance(value, dict):
+        return {name: copied(item) for name, item in value.items()}
+    return value.clone() if isinstance(value, torch.Tensor | TensorDict) else value
+
+
+@pytest.mark.parametrize("name", ["iddpg", "maddpg"])
+def test_it_learns_what_each_agent_should_do(settings, name):
+    config = dataclasses.replace(settings(f"algo={name}").algo, **LEARNS_FAST, initial_sigma=0.5, final_sigma=0.5)
+    torch.manual_seed(0)
+    algorithm = DDPG(config, MLPConfig(hidden=32, layers=2, velocity_scale=1.0), SIZES)
+    assert error_after_learning(algorithm, 32 + 60) < 0.02
+
+
+def test_names_mean_the_switch(settings):
+    assert algorithm_configs()["iddpg"] is algorithm_configs()["maddpg"] is DDPGConfig
+    assert not settings("algo=iddpg").algo.centralised
+    assert settings("algo=maddpg").algo.centralised
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("noise_correlation", 1.0), ("tau", 0.0), ("updates_per_frame", 0.0), ("gamma", 1.5)]
+)
+def test_values_that_make_no_sense_are_refused_by_name(settings, key, value):
+    values = vars(settings("algo=iddpg").algo) | {key: value}
+    with pytest.raises(ValueError, match=rf"^algo\.{key} is {value}: it must "):
+        DDPGConfig(**values)
+
+
+@pytest.mark.parametrize("oracle", [False, True])
+def test_privileged_numbers_reach_the_critic_that_asks_for_them_and_the_actor_of_an_oracle_alone(
+    build, settings, oracle
+):
+    algorithm, env = build("maddpg", "algo.critic.asymmetric=true", task="wall")
+    if oracle:
+        config = settings("task=wall", "algo=maddpg", *SMALL)
+        algorithm = DDPG(config.algo, config.model, env, oracle=True)
+    assert (keys.PRIVILEGED in algorithm.policy.in_keys) == oracle
+    filled(algorithm, env)
+    transitions = algorithm.sample()
+    assert transitions[keys.PRIVILEGED].shape == transitions["next", keys.PRIVILEGED].shape == (16, 4)
+    assert transitions[keys.PRIVILEGED].unique(dim=0).shape[0] > 1
+    assert algorithm.loss(transitions)["loss_value"].isfinite()
