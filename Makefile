@@ -26,12 +26,14 @@ check: setup
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 
-# Speed: rod and environment steps against PyElastica, distance to the roofline, scaling. About ten minutes.
+# Speed: rod and environment steps against PyElastica, distance to the roofline, scaling; SoftGM against
+# torch_geometric. About seven minutes.
 bench: setup
 	$(BIN)/python benchmarks/bench_rod.py
 	$(BIN)/python benchmarks/roofline.py
 	$(BIN)/python benchmarks/bench_env.py
 	$(BIN)/python benchmarks/bench_scaling.py
+	$(BIN)/python benchmarks/bench_models.py
 
 # The same on an NVIDIA GPU.
 bench-gpu: setup
