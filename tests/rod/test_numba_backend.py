@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings, strategies
+from sharp_bends import beyond_polynomials
 
 from softgm_bench.rod.numba_backend import NumbaBackend
 from softgm_bench.rod.numba_contact import make_contact, make_touch
@@ -126,21 +127,7 @@ def test_the_base_is_clamped_and_directors_stay_orthonormal():
 
 
 def test_bends_and_turns_beyond_the_polynomials_range_agree_with_the_reference():
-    """Neighbouring directors 70 degrees apart, a turn of 0.9 rad a substep and a stretch of 3 at once."""
-    parameters = RodParameters(n_elements=6, youngs_modulus=1e3, shear_modulus=4e2, damping_constant=3.0)
-    state = straight_rods(parameters, 1)
-    angle = torch.arange(6, dtype=torch.float64) * 1.2
-    zero, one = torch.zeros_like(angle), torch.ones_like(angle)
-    rotation = torch.stack(
-        [
-            torch.stack([one, zero, zero]),
-            torch.stack([zero, angle.cos(), angle.sin()]),
-            torch.stack([zero, -angle.sin(), angle.cos()]),
-        ]
-    )
-    state.director = torch.einsum("ijn,bjkn->bikn", rotation, state.director)
-    state.position *= torch.linspace(1.0, 3.5, 7)
-    state.omega[:, 0] = torch.linspace(0.0, 4500.0, 6)
+    parameters, state = beyond_polynomials()
     couple = torch.zeros(1, 3, 6, dtype=torch.float64)
     found = NumbaBackend(parameters).control_step(state, couple, substeps=3)
     expected = TorchBackend(parameters).control_step(state, couple, substeps=3)

@@ -9,22 +9,17 @@ Constants are bound in the precision of the kernel: one Python float would promo
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from math import asin, exp, factorial, sqrt
+from math import asin, exp, sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
 from numba import config, cuda
-from numpy.polynomial import Chebyshev, Polynomial
-from numpy.typing import NDArray
 
 from softgm_bench.rod.parameters import RodParameters, rod_constants
+from softgm_bench.rod.series import SMALL_BEND, SMALL_EXPONENT, SMALL_TURN, TINY, bend, cosc, exponential, sinc
 
 SIMULATED = bool(config.ENABLE_CUDASIM)
 
-TINY = 1e-14  # PyElastica adds it to lengths
-SMALL_TURN = 0.25  # squared rotation angle per step up to which the series of sine and cosine hold
-SMALL_BEND = 0.15  # sin^2(theta/2) between neighbouring directors up to which theta / sin(theta) is a polynomial
-SMALL_EXPONENT = 0.2  # |exponent| up to which the exponential's series holds
 _BEND_DEGREE: dict[type, int] = {np.float64: 11, np.float32: 4}
 _TERMS: dict[type, int] = {np.float64: 7, np.float32: 4}  # of sine and cosine
 _MOST_HALVINGS = 20  # of an angle: a turn of more than half a million radians a substep is lost anyway
@@ -70,8 +65,7 @@ def coefficients(parameters: RodParameters, real: type) -> Coefficients:
         ValueError: if the rod is not uniform.
     """
     c, p = rod_constants(parameters), parameters
-    # the exact model's coefficients are densities along the rod
-    per = p.contact_length if p.contact_model == "exact" else 1.0
+    contact = p.contact_coefficients
     rate = c.rotational_decay_rate
     uniform = (c.rest_length, *c.inertia, *c.shear, *c.bend, *rate, c.volume, c.mass[1:-1], 2.0 * c.mass[[0, -1]])
     for values in uniform:
@@ -103,10 +97,10 @@ def coefficients(parameters: RodParameters, real: type) -> Coefficients:
         weight_y=p.gravity[1] * mass,
         weight_z=p.gravity[2] * mass,
         volume_over_pi=c.volume[0] / np.pi,
-        contact_stiffness=p.contact_stiffness / per,
-        contact_damping=p.contact_damping / per,
-        friction=p.friction_coefficient,
-        slip_damping=p.velocity_damping_coefficient / per,
+        contact_stiffness=contact.stiffness,
+        contact_damping=contact.damping,
+        friction=contact.friction,
+        slip_damping=contact.slip_damping,
     )
     return Coefficients(*(real(value) for value in values))
 
@@ -160,8 +154,8 @@ def make_physics(real: type) -> Physics:
 
 def _make_turn(real: type) -> Callable[..., Any]:
     one, half, quarter, four, limit = real(1.0), real(0.5), real(0.25), real(4.0), real(SMALL_TURN)
-    sinc_series = horner(real, [(-1.0) ** j / factorial(2 * j + 1) for j in range(_TERMS[real])])
-    cosc_series = horner(real, [(-1.0) ** j / factorial(2 * j + 2) for j in range(_TERMS[real])])
+    sinc_series = horner(real, sinc(_TERMS[real]))
+    cosc_series = horner(real, cosc(_TERMS[real]))
 
     def turn(dt, w0, w1, w2, q00, q01, q02, q10, q11, q12, q20, q21, q22):
         """Director turned by ``dt * omega`` (Rodrigues). PyElastica: ``_get_rotation_matrix``."""
@@ -236,7 +230,7 @@ def _make_strain(real: type) -> Callable[..., Any]:
 def _make_curvature(real: type) -> Callable[..., Any]:
     one, half, quarter, three = real(1.0), real(0.5), real(0.25), real(3.0)
     limit, largest = real(SMALL_BEND), real(1.0) - np.finfo(real).eps
-    ratio_series = horner(real, _bend_series(_BEND_DEGREE[real]))
+    ratio_series = horner(real, bend(_BEND_DEGREE[real]))
 
     def curvature(
         c,
@@ -290,7 +284,7 @@ def _make_bending(real: type) -> Callable[..., Any]:
 
 def _make_decay(real: type) -> Callable[..., Any]:
     one, limit = real(1.0), real(SMALL_EXPONENT)
-    series = horner(real, [1.0 / factorial(j) for j in range(_EXP_TERMS[real])])
+    series = horner(real, exponential(_EXP_TERMS[real]))
 
     def decay(c, dilatation):
         """Factor of the damper on the axial angular velocity, relative to that at dilatation 1; bending's is squared.
@@ -332,7 +326,7 @@ def _make_straighten(real: type) -> Callable[..., Any]:
     return device(straighten)
 
 
-def horner(real: type, series: Sequence[float] | NDArray[np.float64]) -> Callable[..., Any]:
+def horner(real: type, series: Sequence[float]) -> Callable[..., Any]:
     """Device function that evaluates a polynomial, constant first; unrolled at compile time."""
     constant = real(series[0])
     if len(series) == 1:
@@ -343,11 +337,3 @@ def horner(real: type, series: Sequence[float] | NDArray[np.float64]) -> Callabl
         return rest(x) * x + constant
 
     return device(value)
-
-
-def _bend_series(degree: int) -> NDArray[np.float64]:
-    """``theta / sin(theta)`` as a polynomial of ``sin^2(theta / 2)`` up to ``SMALL_BEND``; exactly 1 at 0."""
-    tail = Chebyshev.interpolate(
-        lambda x: (np.arcsin(np.sqrt(x)) / np.sqrt(x * (1.0 - x)) - 1.0) / x, degree, domain=[0.0, SMALL_BEND]
-    )
-    return np.concatenate([[1.0], tail.convert(kind=Polynomial).coef])

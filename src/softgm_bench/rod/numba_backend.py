@@ -88,17 +88,7 @@ class NumbaBackend:
             real = torch.empty(0, dtype=dtype).numpy().dtype
             rows = constant_rows(p, make_layout(p.n_elements, real.type), real)
             scalars = np.array([p.dt, self._constants.translational_decay, self._constants.volume.max()], dtype=real)
-            # the exact model's coefficients are densities along the rod
-            per = 1.0 if p.contact_model == "pyelastica" else p.contact_length
-            contact = np.array(
-                [
-                    p.contact_stiffness / per,
-                    p.contact_damping / per,
-                    p.friction_coefficient,
-                    p.velocity_damping_coefficient / per,
-                ],
-                dtype=real,
-            )
+            contact = np.array(p.contact_coefficients, dtype=real)
             self._tables[dtype] = rows, scalars, contact
         return self._tables[dtype]
 

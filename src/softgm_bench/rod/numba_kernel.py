@@ -17,29 +17,14 @@ import numba
 import numpy as np
 from llvmlite import ir
 from numba.extending import intrinsic
-from numpy.polynomial import Chebyshev, Polynomial
 
 from softgm_bench.rod.numba_layout import Layout, make_layout
+from softgm_bench.rod.series import SMALL_BEND, SMALL_EXPONENT, SMALL_TURN, TINY, bend, cosc, exponential, sinc
 
 # No NaN test happens inside the kernel, so "nnan" is safe; infinities keep their IEEE meaning.
 FASTMATH = {"contract", "reassoc", "nsz", "nnan", "arcp"}
 
-TINY = 1e-14  # PyElastica adds it to lengths and angles
-
-SMALL_TURN = 0.25  # squared rotation angle per step up to which SINC and COSC hold
-SINC = tuple((-1.0) ** k / float(np.prod(np.arange(1.0, 2 * k + 2))) for k in range(7))
-COSC = tuple((-1.0) ** k / float(np.prod(np.arange(1.0, 2 * k + 3))) for k in range(7))
-SMALL_BEND = 0.15  # sin^2(theta/2) between neighbouring directors up to which BEND holds (theta < 45 degrees)
-BEND = (
-    1.0,
-    *Chebyshev.interpolate(
-        lambda x: (np.arcsin(np.sqrt(x)) / np.sqrt(x * (1.0 - x)) - 1.0) / x, 11, domain=[0.0, SMALL_BEND]
-    )
-    .convert(kind=Polynomial)
-    .coef,
-)
-SMALL_EXPONENT = 0.2  # |exponent| up to which EXP holds
-EXP = tuple(1.0 / float(np.prod(np.arange(1.0, k + 1))) for k in range(11))
+SINC, COSC, BEND, EXP = sinc(7), cosc(7), bend(11), exponential(11)
 
 
 def jit(function: Callable[..., Any], parallel: bool = False, **callees: Callable[..., Any]) -> Callable[..., Any]:

@@ -12,6 +12,15 @@ CONTACT_MODELS = ("pyelastica", "exact")
 Array = NDArray[np.float64]
 
 
+class ContactCoefficients(NamedTuple):
+    """What the fused kernels multiply with; in this order they are the Numba kernel's table."""
+
+    stiffness: float
+    damping: float
+    friction: float
+    slip_damping: float
+
+
 @dataclass(frozen=True)
 class RodParameters:
     """One uniform Cosserat rod with a clamped base, in SI units. The defaults are the paper's arm.
@@ -87,6 +96,17 @@ class RodParameters:
     def n_nodes(self) -> int:
         """Number of nodes, one more than elements."""
         return self.n_elements + 1
+
+    @property
+    def contact_coefficients(self) -> ContactCoefficients:
+        """Of the contact model: per element in ``pyelastica``, densities along the rod in ``exact``."""
+        per = self.contact_length if self.contact_model == "exact" else 1.0
+        return ContactCoefficients(
+            stiffness=self.contact_stiffness / per,
+            damping=self.contact_damping / per,
+            friction=self.friction_coefficient,
+            slip_damping=self.velocity_damping_coefficient / per,
+        )
 
     @property
     def control_dt(self) -> float:
