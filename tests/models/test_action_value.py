@@ -85,20 +85,21 @@ def test_an_independent_critic_on_softgm_knows_others_as_far_as_messages_travel_
 
 
 @ENCODERS
-def test_values_are_those_of_the_concatenated_parts(encoder):
-    td = frames()
-    for centralised in (False, True):
-        network = critic(encoder, centralised)
-        with torch.no_grad():
-            own = graph.agent_channels(td, network.encoder.velocity_scale)
-            parts = torch.cat([own, network.encoder(td), td[keys.ACTION]], dim=-1)
-            rows = [
-                network.function(torch.cat([parts[:, j] for j in range(5)], dim=-1))
-                if centralised
-                else network.function(parts[:, i])
-                for i in range(5)
-            ]
-        torch.testing.assert_close(value(network, td), torch.stack(rows, dim=1))
+def test_independent_values_are_those_of_node_embedding_and_action(encoder):
+    network, td = critic(encoder, centralised=False), frames()
+    with torch.no_grad():
+        own = graph.agent_channels(td, network.encoder.velocity_scale)
+        parts = torch.cat([own, network.encoder(td), td[keys.ACTION]], dim=-1)
+        rows = [network.function(parts[:, agent]) for agent in range(5)]
+    torch.testing.assert_close(value(network, td), torch.stack(rows, dim=1))
+
+
+@ENCODERS
+def test_the_teams_value_is_that_of_all_observations_and_then_all_actions(encoder):
+    network, td = critic(encoder, centralised=True), frames()
+    with torch.no_grad():
+        expected = network.function(network.encoder(td, td[keys.ACTION].flatten(1)))
+    torch.testing.assert_close(value(network, td), expected.unsqueeze(1).expand(-1, 5, -1))
 
 
 @pytest.mark.parametrize("centralised", [False, True])

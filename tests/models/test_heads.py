@@ -120,7 +120,7 @@ def test_the_value_pools_the_agents_mean():
 def test_the_concatenated_value_reads_every_agents_node_and_embedding_side_by_side():
     td = observation((5,))
     value = build_value(softgm_config(), 4, 6, value_config(pooling="concat"))
-    parts = [graph.agent_channels(td), value.encoder(td)]
+    parts = [graph.agent_channels(td), value.encoder.encoder(td)]
     agents = [torch.cat([part[:, agent] for part in parts], dim=-1) for agent in range(4)]
     assert torch.equal(value(td)[STATE_VALUE], value.function(torch.cat(agents, dim=-1)))
 

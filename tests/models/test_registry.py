@@ -1,14 +1,22 @@
 import pytest
 from observations import softgm_config
 
-from softgm_bench.models import MLPConfig, MLPEncoder, SoftGMConfig, SoftGMEncoder, build_encoder, model_configs
+from softgm_bench.models import (
+    MLPConfig,
+    MLPEncoder,
+    SoftGMConfig,
+    SoftGMEncoder,
+    VectorMLPConfig,
+    build_encoder,
+    model_configs,
+)
 from softgm_bench.models.registry import register_model
 
 
 def test_the_configuration_chooses_the_encoder():
     assert isinstance(build_encoder(softgm_config(), 4, 6), SoftGMEncoder)
     assert isinstance(build_encoder(MLPConfig(hidden=8, layers=1, velocity_scale=1.0), 4, 6), MLPEncoder)
-    assert model_configs() == {"softgm": SoftGMConfig, "mlp": MLPConfig}
+    assert model_configs() == {"softgm": SoftGMConfig, "mlp": MLPConfig, "vector_mlp": VectorMLPConfig}
 
 
 def test_a_configuration_of_no_model_is_refused():

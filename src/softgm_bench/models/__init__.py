@@ -7,6 +7,7 @@ from softgm_bench.models.heads import ActorConfig, ValueConfig, build_actor, bui
 from softgm_bench.models.mlp import MLPConfig, MLPEncoder
 from softgm_bench.models.registry import build_encoder, model_configs, register_model
 from softgm_bench.models.softgm import SoftGMConfig, SoftGMEncoder
+from softgm_bench.models.vector_mlp import VectorMLPConfig, VectorMLPEncoder
 
 __all__ = [
     "ActorConfig",
@@ -15,6 +16,8 @@ __all__ = [
     "SoftGMConfig",
     "SoftGMEncoder",
     "ValueConfig",
+    "VectorMLPConfig",
+    "VectorMLPEncoder",
     "build_actor",
     "build_encoder",
     "build_value",

@@ -1,12 +1,11 @@
 """Action values Q(s, a) on any encoder, for the off-policy algorithms.
 
-With x_i = [o_i || g_i || a_i] (own node, embedding, action of agent i):
-
-- independent: Q_i = f_Q(x_i), parameters shared by all agents. It knows of other agents what the encoder passes on,
-  and never their actions.
-- centralised: Q = f_Q([x_1 || .. || x_N]), one value for the team. BenchMARL's centralised critics concatenate all
-  agents' inputs too and share one output. A mean over agents would tell f_Q only the sum of the actions, but the
-  sections of an arm cannot be exchanged. Only training has a critic, so its fixed N binds no policy.
+- independent: Q_i = f_Q([o_i || g_i || a_i]) (own node, embedding, action of agent i), parameters shared by all
+  agents. It knows of other agents what the encoder passes on, and never their actions.
+- centralised: Q = f_Q(e), one value for the team, e the model's embedding of all agents' observations and actions side
+  by side (``TeamEncoder``). BenchMARL's centralised critics concatenate all agents' inputs too and share one output. A
+  mean over agents would tell f_Q only the sum of the actions, but the sections of an arm cannot be exchanged. Only
+  training has a critic, so its fixed N binds no policy.
 """
 
 from dataclasses import dataclass
@@ -17,9 +16,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
 from softgm_bench.envs import keys
-from softgm_bench.models import graph
-from softgm_bench.models.heads import ACTIONS, feedforward, input_keys
-from softgm_bench.models.registry import Encoder, build_encoder
+from softgm_bench.models.heads import ACTIONS, feedforward, input_keys, privileged
+from softgm_bench.models.registry import Encoder, TeamEncoder, build_encoder, build_team_encoder
 
 ACTION_VALUE = ("agents", "state_action_value")  # (B, N, 1)
 
@@ -37,37 +35,41 @@ class ActionValueConfig:
     asymmetric: bool
 
 
-class ActionValue(TensorDictModuleBase):
-    """Reads ``keys.OBSERVATION`` and ``keys.ACTION``, writes ``ACTION_VALUE`` ``(..., N, 1)``.
+class AgentActionValue(TensorDictModuleBase):
+    """Reads ``keys.OBSERVATION`` and ``keys.ACTION``, writes a value per agent in ``ACTION_VALUE`` ``(..., N, 1)``."""
 
-    A centralised one writes its only value N times. Privileged channels follow f_Q's other inputs.
-    """
-
-    def __init__(
-        self,
-        encoder: Encoder,
-        n_agents: int,
-        config: ActionValueConfig,
-        centralised: bool,
-        n_privileged: int = 0,
-    ) -> None:
+    def __init__(self, encoder: Encoder, config: ActionValueConfig, n_privileged: int = 0) -> None:
         """Put f_Q on an encoder."""
         super().__init__()
-        self.in_keys, self.out_keys = [*input_keys(n_privileged), keys.ACTION], [ACTION_VALUE]
-        self.encoder, self.centralised, self.n_privileged = encoder, centralised, n_privileged
-        per_agent = graph.CHANNELS + encoder.out_features + ACTIONS
-        in_features = n_agents * per_agent if centralised else per_agent
-        self.function = feedforward(in_features + n_privileged, config.widths, 1, last_gain=1.0)
+        self.in_keys, self.out_keys = [*input_keys(encoder, n_privileged), keys.ACTION], [ACTION_VALUE]
+        self.encoder, self.n_privileged = encoder, n_privileged
+        in_features = encoder.own_features + encoder.out_features + ACTIONS + n_privileged
+        self.function = feedforward(in_features, config.widths, 1, last_gain=1.0)
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write ``ACTION_VALUE``."""
-        own = graph.agent_channels(td, self.encoder.velocity_scale)
-        parts = torch.cat([own, self.encoder(td), td.get(keys.ACTION)], dim=-1)
-        inputs = parts.flatten(-2).unsqueeze(-2) if self.centralised else parts  # one row for the team, or N
-        if self.n_privileged:
-            known = td.get(keys.PRIVILEGED).unsqueeze(-2)
-            inputs = torch.cat([inputs, known.expand(*inputs.shape[:-1], self.n_privileged)], dim=-1)
-        return td.set(ACTION_VALUE, self.function(inputs).expand(*parts.shape[:-1], 1))
+        own = self.encoder.own(td)
+        known = privileged(td, self.n_privileged, own).unsqueeze(-2).expand(*own.shape[:-1], self.n_privileged)
+        inputs = torch.cat([own, self.encoder(td), td.get(keys.ACTION), known], dim=-1)
+        return td.set(ACTION_VALUE, self.function(inputs))
+
+
+class TeamActionValue(TensorDictModuleBase):
+    """Reads ``keys.OBSERVATION`` and ``keys.ACTION``, writes its value N times in ``ACTION_VALUE`` ``(..., N, 1)``."""
+
+    def __init__(self, encoder: TeamEncoder, n_agents: int, config: ActionValueConfig, n_privileged: int = 0) -> None:
+        """Put f_Q on an encoder whose further inputs are the actions, then the privileged channels."""
+        super().__init__()
+        self.in_keys, self.out_keys = [*input_keys(encoder, n_privileged), keys.ACTION], [ACTION_VALUE]
+        self.encoder, self.n_agents, self.n_privileged = encoder, n_agents, n_privileged
+        self.function = feedforward(encoder.out_features, config.widths, 1, last_gain=1.0)
+
+    def forward(self, td: TensorDictBase) -> TensorDictBase:
+        """Write ``ACTION_VALUE``."""
+        action = td.get(keys.ACTION)
+        further = torch.cat([action.flatten(-2), privileged(td, self.n_privileged, action)], dim=-1)
+        value = self.function(self.encoder(td, further)).unsqueeze(-2)
+        return td.set(ACTION_VALUE, value.expand(*value.shape[:-2], self.n_agents, 1))
 
 
 def build_action_value(
@@ -77,10 +79,12 @@ def build_action_value(
     config: ActionValueConfig,
     centralised: bool,
     n_privileged: int = 0,
-) -> ActionValue:
+) -> AgentActionValue | TeamActionValue:
     """A critic of actions with an encoder of its own, for N agents and M slots.
 
-    With ``n_privileged`` above 0 its head reads ``keys.PRIVILEGED`` too.
+    With ``n_privileged`` above 0 it reads ``keys.PRIVILEGED`` too.
     """
-    encoder = build_encoder(encoder_config, n_agents, n_slots)
-    return ActionValue(encoder, n_agents, config, centralised, n_privileged)
+    if not centralised:
+        return AgentActionValue(build_encoder(encoder_config, n_agents, n_slots), config, n_privileged)
+    encoder = build_team_encoder(encoder_config, n_agents, n_slots, n_agents * ACTIONS + n_privileged)
+    return TeamActionValue(encoder, n_agents, config, n_privileged)

@@ -1,6 +1,6 @@
 """From embeddings to TorchRL actors and critics; the same heads for every encoder.
 
-Each network reads ``keys.OBSERVATION`` from the tensordict itself: an encoder and its head cost one module call. A head
+Each network reads the observation from the tensordict itself: an encoder and its head cost one module call. A head
 that is built with ``n_privileged`` above 0 reads that many channels of ``keys.PRIVILEGED`` too: an asymmetric critic's
 or an oracle's. No encoder ever does.
 """
@@ -23,8 +23,8 @@ from torch import Tensor, nn
 from torchrl.modules import TanhNormal
 
 from softgm_bench.envs import keys
-from softgm_bench.models import graph
-from softgm_bench.models.registry import Encoder, build_encoder
+from softgm_bench.models.activation import Tanh
+from softgm_bench.models.registry import Encoder, TeamEncoder, build_encoder, build_team_encoder
 
 ACTIONS = 2  # normal and binormal
 LOC = ("agents", "loc")  # (B, N, 2), before the bound
@@ -80,7 +80,8 @@ class ValueConfig:
     Attributes:
         widths: hidden layers, each followed by tanh.
         pooling: what a centralised critic makes of N agents. ``mean``: the mean of their embeddings g_i, the paper's;
-            ``concat``: [o_i || g_i] of all agents side by side, MAPPO's. An independent critic pools nothing.
+            ``concat``: all agents side by side, MAPPO's, in the form that the model gives it. An independent critic
+            pools nothing.
         asymmetric: the head reads ``keys.PRIVILEGED`` too. Only training has a critic, so execution does not need it.
     """
 
@@ -98,9 +99,17 @@ class ValueConfig:
             raise ValueError(f"algo.critic.pooling is {self.pooling}: choose one of {', '.join(POOLINGS)}")
 
 
-def input_keys(n_privileged: int) -> list[NestedKey]:
-    """Entries that a network with ``n_privileged`` privileged channels reads."""
-    return [*keys.OBSERVATION, keys.PRIVILEGED] if n_privileged else list(keys.OBSERVATION)
+def input_keys(encoder: Encoder | TeamEncoder, n_privileged: int) -> list[NestedKey]:
+    """Entries that a network on this encoder with ``n_privileged`` privileged channels reads."""
+    return [*encoder.in_keys, keys.PRIVILEGED] if n_privileged else list(encoder.in_keys)
+
+
+def privileged(td: TensorDictBase, n_privileged: int, like: Tensor) -> Tensor:
+    """The channels ``(..., n_privileged)`` of ``keys.PRIVILEGED``, which need not exist where that is 0.
+
+    ``like``: ``(..., n, m)``, whose leading dimensions and device nothing then has.
+    """
+    return td.get(keys.PRIVILEGED) if n_privileged else like[..., 0, :0]
 
 
 def feedforward(in_features: int, widths: Sequence[int], out_features: int, last_gain: float) -> nn.Sequential:
@@ -111,7 +120,7 @@ def feedforward(in_features: int, widths: Sequence[int], out_features: int, last
         linear = nn.Linear(fan_in, fan_out)
         nn.init.orthogonal_(linear.weight, last_gain if index == len(widths) else math.sqrt(2))
         nn.init.zeros_(linear.bias)
-        layers += [linear, nn.Tanh()]
+        layers += [linear, Tanh()]
     return nn.Sequential(*layers[:-1])
 
 
@@ -128,12 +137,12 @@ class AgentHead(nn.Module):
         super().__init__()
         self.encoder = encoder
         self.n_privileged = n_privileged
-        in_features = graph.CHANNELS + encoder.out_features + n_privileged
+        in_features = encoder.own_features + encoder.out_features + n_privileged
         self.function = feedforward(in_features, widths, out_features, last_gain)
 
     def forward(self, td: TensorDictBase) -> Tensor:
         """``(..., N, out_features)``."""
-        parts = [graph.agent_channels(td, self.encoder.velocity_scale), self.encoder(td)]
+        parts = [self.encoder.own(td), self.encoder(td)]
         if self.n_privileged:
             known = td.get(keys.PRIVILEGED).unsqueeze(-2)
             parts.append(known.expand(*parts[0].shape[:-1], self.n_privileged))
@@ -146,7 +155,7 @@ class GaussianPolicy(TensorDictModuleBase):
     def __init__(self, encoder: Encoder, config: ActorConfig, n_privileged: int = 0) -> None:
         """Put the policy's head on an encoder."""
         super().__init__()
-        self.in_keys, self.out_keys = input_keys(n_privileged), [LOC, SCALE]
+        self.in_keys, self.out_keys = input_keys(encoder, n_privileged), [LOC, SCALE]
         outputs = 2 * ACTIONS if config.state_dependent_sigma else ACTIONS
         self.head = AgentHead(encoder, config.widths, outputs, last_gain=0.01, n_privileged=n_privileged)
         self.persistence = config.persistence
@@ -176,29 +185,24 @@ class GaussianPolicy(TensorDictModuleBase):
 class TeamValue(TensorDictModuleBase):
     """A centralised critic: writes one value of the state, ``(..., 1)``.
 
-    Pooling ``mean``: V(s) = f_V(mean over agents of g_i) (section "Distributed Control Policy"). Pooling ``concat``:
-    V(s) = f_V([o_1 || g_1 || .. || o_N || g_N]), MAPPO's, whatever the encoder. Privileged channels follow last.
+    Pooling ``mean``: V(s) = f_V(mean over agents of g_i || w) (section "Distributed Control Policy"), w the privileged
+    channels. Pooling ``concat``: V(s) = f_V(e) with the model's ``TeamEncoder``, which reads w too.
     """
 
-    def __init__(self, encoder: Encoder, config: ValueConfig, n_agents: int, n_privileged: int = 0) -> None:
-        """Put the critic's head on an encoder."""
+    def __init__(self, encoder: Encoder | TeamEncoder, config: ValueConfig, n_privileged: int = 0) -> None:
+        """Put the critic's head on an encoder of agents (pooling ``mean``) or of the team (``concat``)."""
         super().__init__()
-        self.in_keys, self.out_keys = input_keys(n_privileged), [STATE_VALUE]
-        self.encoder, self.pooling, self.n_privileged = encoder, config.pooling, n_privileged
-        of_agent = encoder.out_features
-        pooled = of_agent if self.pooling == "mean" else n_agents * (graph.CHANNELS + of_agent)
-        self.function = feedforward(pooled + n_privileged, config.widths, 1, last_gain=1.0)
+        self.in_keys, self.out_keys = input_keys(encoder, n_privileged), [STATE_VALUE]
+        self.encoder, self.n_privileged = encoder, n_privileged
+        in_features = encoder.out_features + (n_privileged if isinstance(encoder, Encoder) else 0)
+        self.function = feedforward(in_features, config.widths, 1, last_gain=1.0)
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write ``STATE_VALUE``."""
-        embedding = self.encoder(td)
-        if self.pooling == "mean":
-            pooled = embedding.mean(dim=-2)
-        else:
-            own = graph.agent_channels(td, self.encoder.velocity_scale)
-            pooled = torch.cat([own, embedding], dim=-1).flatten(-2)
-        if self.n_privileged:
-            pooled = torch.cat([pooled, td.get(keys.PRIVILEGED)], dim=-1)
+        known = privileged(td, self.n_privileged, td.get(self.in_keys[0]))
+        if isinstance(self.encoder, TeamEncoder):
+            return td.set(STATE_VALUE, self.function(self.encoder(td, known)))
+        pooled = torch.cat([self.encoder(td).mean(dim=-2), known], dim=-1)
         return td.set(STATE_VALUE, self.function(pooled))
 
 
@@ -208,7 +212,7 @@ class AgentValue(TensorDictModuleBase):
     def __init__(self, encoder: Encoder, config: ValueConfig, n_privileged: int = 0) -> None:
         """Put the critic's head on an encoder."""
         super().__init__()
-        self.in_keys, self.out_keys = input_keys(n_privileged), [STATE_VALUE]
+        self.in_keys, self.out_keys = input_keys(encoder, n_privileged), [STATE_VALUE]
         self.head = AgentHead(encoder, config.widths, 1, last_gain=1.0, n_privileged=n_privileged)
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
@@ -258,7 +262,7 @@ def build_value(
     A centralised critic says one value for the team, (B, 1); an independent one a value per agent, (B, N, 1), of what
     that agent's actor reads. With ``n_privileged`` above 0 its head reads ``keys.PRIVILEGED`` too.
     """
+    if centralised and config.pooling == "concat":
+        return TeamValue(build_team_encoder(encoder_config, n_agents, n_slots, n_privileged), config, n_privileged)
     encoder = build_encoder(encoder_config, n_agents, n_slots)
-    if centralised:
-        return TeamValue(encoder, config, n_agents, n_privileged)
-    return AgentValue(encoder, config, n_privileged)
+    return (TeamValue if centralised else AgentValue)(encoder, config, n_privileged)

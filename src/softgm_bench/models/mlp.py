@@ -1,6 +1,8 @@
-"""A per-agent MLP over the flat view: the baselines' encoder, with the same interface as SoftGM's."""
+"""MLPs over the flat view, the baselines' encoders: one for each agent, with SoftGM's interface, and a team's."""
 
+import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -10,7 +12,8 @@ from torch.nn import functional
 
 from softgm_bench.envs import keys
 from softgm_bench.models import graph
-from softgm_bench.models.registry import Encoder, register_model
+from softgm_bench.models.activation import tanh
+from softgm_bench.models.registry import Encoder, TeamEncoder, register_model
 
 
 @dataclass
@@ -28,7 +31,30 @@ class MLPConfig:
     velocity_scale: float
 
 
-@register_model("mlp", MLPConfig)
+class MLPTeamEncoder(TeamEncoder):
+    """One MLP that reads all agents' flat observations and further inputs, as BenchMARL's centralised critics do.
+
+    What the agents' flat observations share, the slots, is read once. It costs a critic N times less than N embeddings.
+    """
+
+    def __init__(self, config: MLPConfig, n_agents: int, n_slots: int, n_further: int) -> None:
+        """Draw the parameters for N agents, M slots and ``n_further`` inputs besides."""
+        super().__init__(config.hidden)
+        self.velocity_scale = config.velocity_scale
+        in_features = n_agents * (graph.CHANNELS + n_slots) + n_slots * graph.CHANNELS + n_further
+        self.layers = nn.ModuleList(orthogonal_layers([in_features, *[config.hidden] * config.layers]))
+
+    def forward(self, td: TensorDictBase, further: Tensor) -> Tensor:
+        """Embeddings ``(..., hidden)`` of own nodes, edges, slots and ``further``, in this order."""
+        own = graph.agent_channels(td, self.velocity_scale)
+        edge, slots = td[keys.EDGE].to(own.dtype), graph.slot_channels(td)
+        hidden = torch.cat([own.flatten(-2), edge.flatten(-2), slots.flatten(-2), further], dim=-1)
+        for layer in self.layers:
+            hidden = tanh(layer(hidden))
+        return hidden
+
+
+@register_model("mlp", MLPConfig, team=MLPTeamEncoder)
 class MLPEncoder(Encoder):
     """Parameters shared by all agents; reads ``graph.flat_observation`` without ever forming it.
 
@@ -39,11 +65,9 @@ class MLPEncoder(Encoder):
     def __init__(self, config: MLPConfig, n_agents: int, n_slots: int) -> None:
         """Draw the parameters for M = ``n_slots``; none depends on N."""
         super().__init__(config.hidden, config.velocity_scale)
-        self.first = nn.Linear(graph.flat_features(n_slots), config.hidden)
-        self.rest = nn.ModuleList(nn.Linear(config.hidden, config.hidden) for _ in range(config.layers - 1))
-        for layer in (self.first, *self.rest):
-            nn.init.orthogonal_(layer.weight, math.sqrt(2))
-            nn.init.zeros_(layer.bias)
+        sizes = [graph.flat_features(n_slots), *[config.hidden] * config.layers]
+        self.first, *rest = orthogonal_layers(sizes)
+        self.rest = nn.ModuleList(rest)
 
     def forward(self, td: TensorDictBase) -> Tensor:
         """Embeddings ``(..., N, hidden)`` from the entries ``keys.OBSERVATION``."""
@@ -57,7 +81,16 @@ class MLPEncoder(Encoder):
         # One product for the agent's own two parts.
         private = torch.cat([own, edge.to(own.dtype)], dim=-1)
         hidden = functional.linear(private, torch.cat([own_weight, edge_weight], dim=1)) + shared.unsqueeze(-2)
-        hidden = hidden.tanh()
+        hidden = tanh(hidden)
         for layer in self.rest:
-            hidden = layer(hidden).tanh()
+            hidden = tanh(layer(hidden))
         return hidden
+
+
+def orthogonal_layers(sizes: Sequence[int]) -> list[nn.Linear]:
+    """Hidden layers, each to be followed by tanh: orthogonal weights (gain sqrt 2), zero biases."""
+    layers = [nn.Linear(fan_in, fan_out) for fan_in, fan_out in itertools.pairwise(sizes)]
+    for layer in layers:
+        nn.init.orthogonal_(layer.weight, math.sqrt(2))
+        nn.init.zeros_(layer.bias)
+    return layers

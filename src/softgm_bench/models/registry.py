@@ -1,19 +1,30 @@
 """Which encoder a configuration means: one table, filled by ``register_model``."""
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
-from tensordict import TensorDictBase
+import torch
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor, nn
+
+from softgm_bench.envs import keys
+from softgm_bench.models import graph
 
 
 class Encoder(nn.Module):
     """What the heads and the algorithms know of an encoder: one embedding per agent.
 
+    What is said here of the observation is the arm's; an encoder of another one says otherwise.
+
     Attributes:
+        in_keys: the observation, which heads and encoder read.
+        own_features: length of o_i, what heads put beside agent i's embedding g_i.
         out_features: length of an embedding.
         velocity_scale: factor that the encoder applies to the agents' velocities; heads that read them do the same.
     """
+
+    in_keys: ClassVar[tuple[NestedKey, ...]] = keys.OBSERVATION
+    own_features: ClassVar[int] = graph.CHANNELS
 
     def __init__(self, out_features: int, velocity_scale: float) -> None:
         """Remember what the heads ask for."""
@@ -21,27 +32,71 @@ class Encoder(nn.Module):
         self.out_features = out_features
         self.velocity_scale = velocity_scale
 
+    def own(self, td: TensorDictBase) -> Tensor:
+        """o_i, the agents' own nodes, ``(..., N, own_features)``."""
+        return graph.agent_channels(td, self.velocity_scale)
+
     def forward(self, td: TensorDictBase) -> Tensor:
-        """Embeddings ``(..., N, out_features)`` from the entries ``keys.OBSERVATION``."""
+        """Embeddings ``(..., N, out_features)`` from the entries ``in_keys``."""
         raise NotImplementedError
+
+
+class TeamEncoder(nn.Module):
+    """What centralised critics know of an encoder: one embedding of all agents' observations and of further inputs.
+
+    Attributes:
+        in_keys: the observation.
+        out_features: length of the embedding.
+    """
+
+    def __init__(self, out_features: int, in_keys: tuple[NestedKey, ...] = keys.OBSERVATION) -> None:
+        """Remember what the heads ask for."""
+        super().__init__()
+        self.out_features, self.in_keys = out_features, in_keys
+
+    def forward(self, td: TensorDictBase, further: Tensor) -> Tensor:
+        """Embeddings ``(..., out_features)`` of the entries ``in_keys`` and inputs ``(..., n_further)``."""
+        raise NotImplementedError
+
+
+class SideBySide(TeamEncoder):
+    """[o_1 || g_1 || .. || o_N || g_N || further], for models without a form of their own."""
+
+    def __init__(self, encoder: Encoder, n_agents: int, n_further: int) -> None:
+        """Put N agents' own nodes and embeddings side by side."""
+        of_agent = encoder.own_features + encoder.out_features
+        super().__init__(n_agents * of_agent + n_further, encoder.in_keys)
+        self.encoder = encoder
+
+    def forward(self, td: TensorDictBase, further: Tensor) -> Tensor:
+        """``(..., out_features)``."""
+        of_agents = torch.cat([self.encoder.own(td), self.encoder(td)], dim=-1)
+        return torch.cat([of_agents.flatten(-2), further], dim=-1)
 
 
 EncoderClass = TypeVar("EncoderClass", bound=type[Encoder])
 
 _configs: dict[str, type] = {}
 _encoders: dict[type, Callable[..., Encoder]] = {}
+_team_encoders: dict[type, Callable[..., TeamEncoder]] = {}
 
 
-def register_model(name: str, config: type) -> Callable[[EncoderClass], EncoderClass]:
+def register_model(
+    name: str, config: type, team: Callable[..., TeamEncoder] | None = None
+) -> Callable[[EncoderClass], EncoderClass]:
     """Class decorator: ``config`` (a dataclass, the schema of ``conf/model/<name>.yaml``) means this encoder.
 
-    The class is called with the configuration, N and M.
+    The class is called with the configuration, N and M (or F, of a vector). ``team``, called with the number of further
+    inputs besides, is the model's own form for centralised critics; without one they put the agents' embeddings side by
+    side.
     """
 
     def register(encoder: EncoderClass) -> EncoderClass:
         if name in _configs or config in _encoders:
             raise ValueError(f"model {name!r} or its configuration {config.__name__} is registered already")
         _configs[name], _encoders[config] = config, encoder
+        if team is not None:
+            _team_encoders[config] = team
         return encoder
 
     return register
@@ -53,7 +108,7 @@ def model_configs() -> dict[str, type]:
 
 
 def build_encoder(config: Any, n_agents: int, n_slots: int) -> Encoder:
-    """The encoder that ``config`` means, for N agents and M slots.
+    """The encoder that ``config`` means, for N agents and M slots, or F features where an observation is a vector.
 
     Raises:
         ValueError: if ``config`` is no registered model's.
@@ -61,3 +116,14 @@ def build_encoder(config: Any, n_agents: int, n_slots: int) -> Encoder:
     if type(config) not in _encoders:
         raise ValueError(f"{type(config).__name__} is no model's configuration; models: {sorted(_configs)}")
     return _encoders[type(config)](config, n_agents, n_slots)
+
+
+def build_team_encoder(config: Any, n_agents: int, n_slots: int, n_further: int) -> TeamEncoder:
+    """What the model that ``config`` means offers to centralised critics; ``n_further`` inputs beside observations.
+
+    Raises:
+        ValueError: if ``config`` is no registered model's.
+    """
+    if type(config) in _team_encoders:
+        return _team_encoders[type(config)](config, n_agents, n_slots, n_further)
+    return SideBySide(build_encoder(config, n_agents, n_slots), n_agents, n_further)
