@@ -51,7 +51,7 @@ class DeterministicPolicy(TensorDictModuleBase):
     def __init__(self, encoder: Encoder, config: DeterministicActorConfig, n_privileged: int = 0) -> None:
         """Put the policy's head on an encoder."""
         super().__init__()
-        self.in_keys, self.out_keys = input_keys(n_privileged), [keys.ACTION]
+        self.in_keys, self.out_keys = input_keys(encoder, n_privileged), [keys.ACTION]
         self.head = AgentHead(encoder, config.widths, ACTIONS, last_gain=0.01, n_privileged=n_privileged)
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:

@@ -12,8 +12,10 @@ from torchrl.objectives import LossModule, SoftUpdate, ValueEstimators
 
 from softgm_bench.algorithms.replay import Replay
 from softgm_bench.algorithms.team import give_to_agents
+from softgm_bench.algorithms.vector_replay import VectorReplay
 from softgm_bench.envs import SoftArmEnv, keys
 from softgm_bench.models.action_value import ActionValueConfig
+from softgm_bench.models.heads import ACTIONS
 
 # The team's reward and end of episode, as TorchRL's losses read them: per agent, (B, N, 1).
 AGENT_REWARD, AGENT_DONE, AGENT_TERMINATED = ("agents", "reward"), ("agents", "done"), ("agents", "terminated")
@@ -102,7 +104,9 @@ class Explorer(TensorDictModuleBase):
         """Write ``keys.ACTION``."""
         explores = exploration_type() is ExplorationType.RANDOM
         if explores and self.uniform:
-            return td.set(keys.ACTION, torch.empty_like(td.get(keys.PREVIOUS_ACTION)).uniform_(-1.0, 1.0))
+            agents = td.get(self.in_keys[0])  # (..., N, any)
+            action = torch.empty((*agents.shape[:-1], ACTIONS), device=agents.device)
+            return td.set(keys.ACTION, action.uniform_(-1.0, 1.0))
         action = self.actor(td.copy()).get(keys.ACTION)
         return td.set(keys.ACTION, self.explore(action, td) if explores else action)
 
@@ -140,8 +144,7 @@ class OffPolicy:
         loss.make_value_estimator(ValueEstimators.TD0, gamma=config.gamma)
         self.target_update = SoftUpdate(loss, tau=config.tau)
         self.optimizers: dict[str, torch.optim.Optimizer] = {}
-        sizes = (env.batch_size[0], env.n_agents, env.n_slots)
-        self.replay = Replay(config.replay_capacity, *sizes, env.device, n_privileged)
+        self.replay = _make_replay(config.replay_capacity, env, n_privileged)
         self.frames = 0
         self._due = 0.0  # gradient steps, of which whole ones are taken
         self._schedule()
@@ -208,7 +211,7 @@ class OffPolicy:
 
     def _optimize(self, name: str, parameters: list[nn.Parameter], lr: float) -> None:
         """Add an optimiser."""
-        self.optimizers[name] = torch.optim.Adam(parameters, lr=lr, eps=ADAM_EPSILON)
+        self.optimizers[name] = torch.optim.Adam(parameters, lr=lr, eps=ADAM_EPSILON, fused=True)
 
     @property
     def _names(self) -> list[str]:
@@ -247,3 +250,10 @@ class OffPolicy:
     def _metrics(self, losses: TensorDictBase) -> list[Tensor]:
         """What ``reported`` names, from what the loss returned."""
         raise NotImplementedError
+
+
+def _make_replay(capacity: int, env: SoftArmEnv, n_privileged: int) -> Replay | VectorReplay:
+    """The memory that fits what the environment observes."""
+    if keys.SLOT_DESCRIPTOR in env.observation_spec.keys(True, True):
+        return Replay(capacity, env.batch_size[0], env.n_agents, env.n_slots, env.device, n_privileged)
+    return VectorReplay(capacity, env.device)

@@ -121,8 +121,8 @@ class PPO:
         self._trained_on = (*read, keys.ACTION, keys.LOG_PROB, ADVANTAGE, VALUE_TARGET)
         self._actor_parameters = list(self.policy.parameters())
         self._critic_parameters = list(self.critic.parameters())
-        self.actor_optimizer = torch.optim.Adam(self._actor_parameters, lr=config.actor_lr, eps=1e-5)
-        self.critic_optimizer = torch.optim.Adam(self._critic_parameters, lr=config.critic_lr, eps=1e-5)
+        self.actor_optimizer = torch.optim.Adam(self._actor_parameters, lr=config.actor_lr, eps=1e-5, fused=True)
+        self.critic_optimizer = torch.optim.Adam(self._critic_parameters, lr=config.critic_lr, eps=1e-5, fused=True)
         self.trained_frames = 0
         self._kl_scale = 1.0  # of the actor's learning rate
 

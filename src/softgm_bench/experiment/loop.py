@@ -1,5 +1,8 @@
 """One run: collect, update, evaluate, write down."""
 
+import ctypes
+import math
+import platform
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,6 +19,7 @@ from torchrl.envs.utils import ExplorationType
 from softgm_bench.algorithms import Algorithm, build_algorithm
 from softgm_bench.config import Config, UserError, available_threads, dtype_of, plain
 from softgm_bench.envs import SoftArmEnv, make_env
+from softgm_bench.envs.vmas import VmasConfig, VmasEnv
 from softgm_bench.experiment import checkpoint, run_folder
 from softgm_bench.experiment.evaluation import DISCOUNT, EpisodeRecords, evaluate
 from softgm_bench.experiment.interruption import Interrupted, Interruption
@@ -23,6 +27,8 @@ from softgm_bench.experiment.metrics import CsvWriter, EpisodeTracker, step_metr
 from softgm_bench.experiment.progress import Progress
 from softgm_bench.experiment.run_folder import RunFolder
 from softgm_bench.experiment.summary import summarise, table, versions
+
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # glibc's malloc.h
 
 
 class Seeds(NamedTuple):
@@ -46,7 +52,7 @@ class Run:
     config: Config
     folder: RunFolder
     seeds: Seeds
-    env: SoftArmEnv
+    env: SoftArmEnv | VmasEnv
     algorithm: Algorithm
     episodes: EpisodeTracker
     started: float
@@ -101,17 +107,30 @@ def derive_seeds(seed: int) -> Seeds:
 
 
 def set_threads(threads: int | None) -> int:
-    """Let torch and Numba use this many threads, or all there are; returns how many."""
+    """Let torch and Numba use this many threads, or all there are; returns how many.
+
+    Matrix products on the CPU go to oneDNN. The package's ``__init__`` says why, and why they stay float32.
+    """
     count = threads or available_threads()
     torch.set_num_threads(count)
     numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))
+    torch.backends.mkldnn.matmul.fp32_precision = "bf16"  # type: ignore[attr-defined]
     return count
+
+
+def keep_memory() -> None:
+    """Let glibc keep freed memory: tensors of a megabyte would otherwise be mapped anew, page by page, at every use."""
+    if platform.libc_ver()[0] == "glibc":
+        libc = ctypes.CDLL(None)
+        libc.mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
+        libc.mallopt(M_MMAP_THRESHOLD, 2**25)  # the largest that glibc accepts
 
 
 def _begin(config: Config) -> Run:
     started = time.perf_counter()
     seeds = derive_seeds(config.seed)
     set_threads(config.threads)
+    keep_memory()
     torch.manual_seed(seeds.torch)
     experiment = config.experiment
     env = _make_env(config, experiment.num_envs, seeds.training, experiment.train_horizon, training=True)
@@ -123,7 +142,11 @@ def _begin(config: Config) -> Run:
     return Run(config, folder, seeds, env, algorithm, EpisodeTracker(experiment.num_envs, config.device), started)
 
 
-def _make_env(config: Config, num_envs: int, seed: int, horizon: int | None, training: bool = False) -> SoftArmEnv:
+def _make_env(
+    config: Config, num_envs: int, seed: int, horizon: int | None, training: bool = False
+) -> SoftArmEnv | VmasEnv:
+    if isinstance(config.task, VmasConfig):
+        return VmasEnv(config.task, num_envs, seed, horizon)
     return make_env(
         config.task,
         config.rod,
@@ -148,7 +171,7 @@ def _learn(run: Run, interruption: Interruption, progress: Progress) -> None:
             run.frames += batch.numel()
             row = _row(run, batch, losses, time.perf_counter() - began)
             metrics.write(row)
-            progress.advance(batch.numel(), row["success_rate"])
+            progress.advance(batch.numel(), row.get("success_rate", math.nan))
             interruption.check()
             if _crossed(experiment.evaluation.interval, run.frames, batch.numel()):
                 _evaluate_in_training(run, interruption, progress)
@@ -214,9 +237,10 @@ def _evaluate_in_training(run: Run, interruption: Interruption, progress: Progre
     at = {"evaluation": run.evaluations, "iteration": run.iteration, "frames": run.frames, "wall_time": run.wall_time}
     with run.folder.evaluations.open("a") as file:
         file.write(run_folder.to_json(at | metrics) + "\n")
-    success, length = metrics["success_rate"]["mean"], metrics["episode_length"]["mean"]
+    value, length = metrics["undiscounted_return"]["mean"], metrics["episode_length"]["mean"]
+    achieved = f"success {metrics['success_rate']['mean']:.2f}" if "success_rate" in metrics else f"return {value:.2f}"
     oracle = " (oracle)" if run.config.oracle else ""
-    progress.say(f"evaluation after {run.frames} frames{oracle}: success {success:.2f}, {length:.1f} steps an episode")
+    progress.say(f"evaluation after {run.frames} frames{oracle}: {achieved}, {length:.1f} steps an episode")
 
 
 def _save(run: Run) -> Path:
