@@ -66,7 +66,7 @@ def actor_config(**changes):
 
 
 def value_config(**changes):
-    values = {"widths": [8], "pooling": "mean", "asymmetric": False}
+    values = {"widths": [8], "pooling": "mean", "mlp": None, "asymmetric": False}
     return ValueConfig(**(values | changes))
 
 

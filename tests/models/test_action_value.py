@@ -1,10 +1,13 @@
+import functools
+
 import pytest
 import torch
 from observations import observation, randomise, softgm_config
 
 from softgm_bench.envs import keys
-from softgm_bench.models import MLPConfig, graph
+from softgm_bench.models import MLPConfig, MLPEncoder, graph
 from softgm_bench.models.action_value import ACTION_VALUE, ActionValueConfig, build_action_value
+from softgm_bench.models.mlp import MLPTeamEncoder
 
 MLP = MLPConfig(hidden=8, layers=2, velocity_scale=0.5)
 ENCODERS = pytest.mark.parametrize("encoder", [softgm_config(), MLP], ids=["softgm", "mlp"])
@@ -14,7 +17,7 @@ OWN = (keys.AGENT_POSITION, keys.AGENT_VELOCITY, keys.PREVIOUS_ACTION, keys.ACTI
 def critic(encoder, centralised, n_agents=5, seed=0):
     torch.manual_seed(seed)
     return randomise(
-        build_action_value(encoder, n_agents, 6, ActionValueConfig(widths=[8], asymmetric=False), centralised)
+        build_action_value(encoder, n_agents, 6, ActionValueConfig(widths=[8], mlp=None, asymmetric=False), centralised)
     )
 
 
@@ -102,6 +105,13 @@ def test_the_teams_value_is_that_of_all_observations_and_then_all_actions(encode
     torch.testing.assert_close(value(network, td), expected.unsqueeze(1).expand(-1, 5, -1))
 
 
+def test_a_critic_may_have_an_mlp_of_its_own_whatever_the_actors_model():
+    config = ActionValueConfig(widths=[8], mlp=MLP, asymmetric=False)
+    build = functools.partial(build_action_value, softgm_config(), 5, 6, config)
+    assert isinstance(build(centralised=True).encoder, MLPTeamEncoder)
+    assert isinstance(build(centralised=False).encoder, MLPEncoder)
+
+
 @pytest.mark.parametrize("centralised", [False, True])
 def test_only_an_asymmetric_critic_reads_what_is_privileged(centralised):
     td = frames()
@@ -111,7 +121,7 @@ def test_only_an_asymmetric_critic_reads_what_is_privileged(centralised):
     plain = critic(MLP, centralised)
     assert keys.PRIVILEGED not in plain.in_keys
     assert torch.equal(value(plain, td), value(plain, other))
-    config = ActionValueConfig(widths=[8], asymmetric=True)
+    config = ActionValueConfig(widths=[8], mlp=None, asymmetric=True)
     told = randomise(build_action_value(MLP, 5, 6, config, centralised, n_privileged=4))
     assert keys.PRIVILEGED in told.in_keys
     assert value(told, td).shape == (7, 5, 1)

@@ -4,8 +4,9 @@ from observations import actor_config, observation, randomise, softgm_config, va
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from softgm_bench.envs import keys
-from softgm_bench.models import MLPConfig, build_actor, build_value, graph
+from softgm_bench.models import MLPConfig, MLPEncoder, build_actor, build_value, graph
 from softgm_bench.models.heads import LOC, POOLINGS, SCALE, STATE_VALUE
+from softgm_bench.models.mlp import MLPTeamEncoder
 
 ENCODERS = pytest.mark.parametrize(
     "encoder", [softgm_config(), MLPConfig(hidden=8, layers=2, velocity_scale=1.0)], ids=["softgm", "mlp"]
@@ -123,6 +124,14 @@ def test_the_concatenated_value_reads_every_agents_node_and_embedding_side_by_si
     parts = [graph.agent_channels(td), value.encoder.encoder(td)]
     agents = [torch.cat([part[:, agent] for part in parts], dim=-1) for agent in range(4)]
     assert torch.equal(value(td)[STATE_VALUE], value.function(torch.cat(agents, dim=-1)))
+
+
+@ENCODERS
+def test_a_critic_may_have_an_mlp_of_its_own_whatever_the_actors_model(encoder):
+    mlp = MLPConfig(hidden=8, layers=1, velocity_scale=1.0)
+    config = value_config(pooling="concat", mlp=mlp)
+    assert isinstance(build_value(encoder, 4, 6, config).encoder, MLPTeamEncoder)
+    assert isinstance(build_value(encoder, 4, 6, config, centralised=False).head.encoder, MLPEncoder)
 
 
 @ENCODERS

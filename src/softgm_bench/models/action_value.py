@@ -17,6 +17,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from softgm_bench.envs import keys
 from softgm_bench.models.heads import ACTIONS, feedforward, input_keys, privileged
+from softgm_bench.models.mlp import MLPConfig
 from softgm_bench.models.registry import Encoder, TeamEncoder, build_encoder, build_team_encoder
 
 ACTION_VALUE = ("agents", "state_action_value")  # (B, N, 1)
@@ -28,10 +29,12 @@ class ActionValueConfig:
 
     Attributes:
         widths: hidden layers, each followed by tanh.
+        mlp: the critic's encoder is this MLP, whatever the actor's; None: the same model as the actor's.
         asymmetric: the head reads ``keys.PRIVILEGED`` too. Only training has a critic, so execution does not need it.
     """
 
     widths: list[int]
+    mlp: MLPConfig | None
     asymmetric: bool
 
 
@@ -84,6 +87,7 @@ def build_action_value(
 
     With ``n_privileged`` above 0 it reads ``keys.PRIVILEGED`` too.
     """
+    encoder_config = config.mlp or encoder_config
     if not centralised:
         return AgentActionValue(build_encoder(encoder_config, n_agents, n_slots), config, n_privileged)
     encoder = build_team_encoder(encoder_config, n_agents, n_slots, n_agents * ACTIONS + n_privileged)

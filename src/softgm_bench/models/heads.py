@@ -24,6 +24,7 @@ from torchrl.modules import TanhNormal
 
 from softgm_bench.envs import keys
 from softgm_bench.models.activation import Tanh
+from softgm_bench.models.mlp import MLPConfig
 from softgm_bench.models.registry import Encoder, TeamEncoder, build_encoder, build_team_encoder
 
 ACTIONS = 2  # normal and binormal
@@ -82,11 +83,13 @@ class ValueConfig:
         pooling: what a centralised critic makes of N agents. ``mean``: the mean of their embeddings g_i, the paper's;
             ``concat``: all agents side by side, MAPPO's, in the form that the model gives it. An independent critic
             pools nothing.
+        mlp: the critic's encoder is this MLP, whatever the actor's; None: the same model as the actor's.
         asymmetric: the head reads ``keys.PRIVILEGED`` too. Only training has a critic, so execution does not need it.
     """
 
     widths: list[int]
     pooling: str
+    mlp: MLPConfig | None
     asymmetric: bool
 
     def __post_init__(self) -> None:
@@ -262,6 +265,7 @@ def build_value(
     A centralised critic says one value for the team, (B, 1); an independent one a value per agent, (B, N, 1), of what
     that agent's actor reads. With ``n_privileged`` above 0 its head reads ``keys.PRIVILEGED`` too.
     """
+    encoder_config = config.mlp or encoder_config
     if centralised and config.pooling == "concat":
         return TeamValue(build_team_encoder(encoder_config, n_agents, n_slots, n_privileged), config, n_privileged)
     encoder = build_encoder(encoder_config, n_agents, n_slots)
