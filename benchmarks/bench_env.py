@@ -8,13 +8,12 @@ fastest of several repetitions, so that other load on the machine spoils as litt
 
 import argparse
 import time
-from collections import defaultdict
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import torch
 from record import write
+from timing import Stopwatch
 
 from softgm_bench.config import compose
 from softgm_bench.envs import SoftArmEnv, keys, make_env
@@ -25,36 +24,6 @@ SIZES = (1, 16, 64, 256, 1024)
 DTYPES = {"float64": torch.float64, "float32": torch.float32}
 HORIZON = 200
 PARTS = ("rod", "sensing", "reward and observation", "resets", "framework")
-
-
-class Stopwatch:
-    """Seconds by part; time inside a nested part counts for that one alone."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = defaultdict(float)
-        self._stack: list[str] = []
-        self._since = 0.0
-
-    def watch(self, owner: Any, name: str, part: str) -> None:
-        """Time every call of the method ``name`` of one object."""
-        method: Callable[..., Any] = getattr(owner, name)
-
-        def timed(*args: Any, **kwargs: Any) -> Any:
-            self._switch()
-            self._stack.append(part)
-            try:
-                return method(*args, **kwargs)
-            finally:
-                self._switch()
-                self._stack.pop()
-
-        setattr(owner, name, timed)
-
-    def _switch(self) -> None:
-        now = time.perf_counter()
-        if self._stack:
-            self.seconds[self._stack[-1]] += now - self._since
-        self._since = now
 
 
 def watched(env: SoftArmEnv) -> Stopwatch:

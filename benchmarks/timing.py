@@ -1,7 +1,9 @@
-"""Rates measured as the best of several repetitions, so that other load on the machine spoils as little as possible."""
+"""Rates as the best of several repetitions, so that other load on the machine spoils little; where the time goes."""
 
 import time
+from collections import defaultdict
 from collections.abc import Callable
+from typing import Any
 
 import torch
 
@@ -50,3 +52,33 @@ def kernel_rate(
         state = rod.control_step(state, couple, cylinders=cylinders)
 
     return best_rate(work, num_envs * parameters.substeps, seconds, repetitions)
+
+
+class Stopwatch:
+    """Seconds by part; time inside a nested part counts for that one alone."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = defaultdict(float)
+        self._stack: list[str] = []
+        self._since = 0.0
+
+    def watch(self, owner: Any, name: str, part: str) -> None:
+        """Time every call of the method ``name`` of one object."""
+        method: Callable[..., Any] = getattr(owner, name)
+
+        def timed(*args: Any, **kwargs: Any) -> Any:
+            self._switch()
+            self._stack.append(part)
+            try:
+                return method(*args, **kwargs)
+            finally:
+                self._switch()
+                self._stack.pop()
+
+        setattr(owner, name, timed)
+
+    def _switch(self) -> None:
+        now = time.perf_counter()
+        if self._stack:
+            self.seconds[self._stack[-1]] += now - self._since
+        self._since = now
