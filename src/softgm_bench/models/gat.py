@@ -17,6 +17,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from softgm_bench.models.chain_kernel import ChainAttention
+
 NEGATIVE_SLOPE = 0.2  # of LeakyReLU, as in Velickovic et al. 2018; the paper gives none
 
 
@@ -27,11 +29,13 @@ class Projection(NamedTuple):
         message: u, ``(..., H, C)``.
         source: the node's part of a score as a source: ``(..., H)``, for GATv2 ``(..., H, C)``.
         target: the same as a target; None for nodes that receive nothing.
+        values: all of it side by side, as it was computed, ``(..., out + 2 H)``; for GATv2 ``(..., 2 out)``.
     """
 
     message: Tensor
     source: Tensor
     target: Tensor | None
+    values: Tensor
 
 
 class GraphAttention(nn.Module):
@@ -104,9 +108,9 @@ class GraphAttention(nn.Module):
         message = values[..., :out].unflatten(-1, (self.heads, self.channels))
         if self.gatv2:
             target = values[..., out:].unflatten(-1, (self.heads, self.channels)) if receives else None
-            return Projection(message, message, target)
+            return Projection(message, message, target, values)
         source = values[..., out : out + self.heads]
-        return Projection(message, source, values[..., out + self.heads :] if receives else None)
+        return Projection(message, source, values[..., out + self.heads :] if receives else None, values)
 
     def entity_to_agent(
         self, agents: Projection, entities: Projection, source: Tensor, target: Tensor
@@ -144,7 +148,10 @@ class GraphAttention(nn.Module):
             itself and the next one; zero where there is none.
         """
         assert agents.target is not None
-        message, source, target = (part.unflatten(0, (-1, n_agents)) for part in agents if part is not None)
+        if self._compiles(agents.values):
+            out, weights = ChainAttention.apply(agents.values, n_agents, self.heads, NEGATIVE_SLOPE)
+            return out + self.bias, weights.unflatten(1, (-1, n_agents))
+        message, source, target = (part.unflatten(0, (-1, n_agents)) for part in agents[:3] if part is not None)
         absent = message.new_full((1,), -math.inf).expand(message.shape[0], 1, self.heads)
         previous = torch.cat([absent, self._score(target[:, 1:] + source[:, :-1])], dim=1)
         following = torch.cat([self._score(target[:, :-1] + source[:, 1:]), absent], dim=1)
@@ -154,6 +161,11 @@ class GraphAttention(nn.Module):
         aggregated[:, 1:].add_(before[:, 1:] * message[:, :-1])  # addcmul_ has no batching rule under vmap
         aggregated[:, :-1].add_(after[:, :-1] * message[:, 1:])
         return self.output(aggregated).flatten(0, 1), weights
+
+    def _compiles(self, values: Tensor) -> bool:
+        """Whether ``ChainAttention`` can do it: the paper's scores, on a CPU, under no transformation such as vmap."""
+        plain = not torch._C._functorch.is_functorch_wrapped_tensor(values)
+        return plain and not self.gatv2 and values.device.type == "cpu"
 
     def output(self, aggregated: Tensor) -> Tensor:
         """Concatenate the heads of ``(..., H, C)`` and add the bias: ``(..., out_features)``."""
