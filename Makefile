@@ -3,7 +3,7 @@ PYTHON ?= python3.11
 BIN := .venv/bin
 STAMP := .venv/.setup
 
-.PHONY: setup train test test-slow check bench bench-gpu parity validation
+.PHONY: setup train test test-slow check bench bench-gpu parity validation peers peers-setup
 
 setup: $(STAMP)
 
@@ -46,3 +46,20 @@ parity: setup
 
 validation: setup
 	$(BIN)/python benchmarks/validation.py
+
+# Our algorithms and BenchMARL's on two VMAS tasks. BenchMARL needs an older TorchRL, so it has a virtual environment of
+# its own. Runs of which the results are there already are left out; all of them take an hour or two on a core.
+PEERS := benchmarks/peers
+PEERS_STAMP := $(PEERS)/.venv/.setup
+THREADS ?= 1
+
+peers-setup: $(PEERS_STAMP)
+
+$(PEERS_STAMP): $(PEERS)/requirements.txt
+	test -x $(PEERS)/.venv/bin/python || $(PYTHON) -m venv $(PEERS)/.venv
+	$(PEERS)/.venv/bin/python -m pip install --quiet -r $(PEERS)/requirements.txt
+	touch $@
+
+peers: setup peers-setup
+	$(BIN)/python $(PEERS)/run_all.py --threads $(THREADS)
+	$(BIN)/python $(PEERS)/report.py

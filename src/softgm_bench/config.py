@@ -238,32 +238,65 @@ def _validate_by_building(config: Config) -> None:
 
     from softgm_bench.envs import make_env
     from softgm_bench.envs.tasks import make_task
+    from softgm_bench.envs.vmas import VmasConfig, VmasEnv
     from softgm_bench.models.registry import build_encoder
 
     try:
-        make_task(config.task).sample(1, torch.Generator())  # on the CPU, where ranges that leave nothing show
-        env = make_env(
-            config.task,
-            config.rod,
-            1,
-            config.seed,
-            device=config.device,
-            backend=config.backend,
-            dtype=dtype_of(config),
-            curriculum=True,
-        )
-        build_encoder(config.model, env.n_agents, env.n_slots)
+        if isinstance(config.task, VmasConfig):
+            _validate_vmas(config)
+            env = VmasEnv(config.task, 1, config.seed)
+        else:
+            make_task(config.task).sample(1, torch.Generator())  # on the CPU, where ranges that leave nothing show
+            env = make_env(
+                config.task,
+                config.rod,
+                1,
+                config.seed,
+                device=config.device,
+                backend=config.backend,
+                dtype=dtype_of(config),
+                curriculum=True,
+            )
+        observed = set(env.observation_spec.keys(True, True))
+        encoder = build_encoder(config.model, env.n_agents, env.n_slots)
     except ValueError as error:
         raise UserError(str(error)) from error
+    if not observed.issuperset(encoder.in_keys):
+        fitting = "vector_mlp" if isinstance(config.task, VmasConfig) else "mlp or softgm"
+        raise UserError(f"task={config.task.name} cannot be observed by this model: add model={fitting}")
+
+
+def _validate_vmas(config: Config) -> None:
+    """Refuse what only the arm has.
+
+    Raises:
+        ValueError: with one line naming the key, its value and what would be right.
+    """
+    task = f"task={config.task.name}"
+    if config.device != "cpu":
+        raise ValueError(f"device={config.device}: {task} runs on the CPU")
+    if config.oracle:
+        raise ValueError(f"observation=oracle: {task} has nothing that an oracle would be told")
+    needing_memory = {
+        "algo.noise_correlation": getattr(config.algo, "noise_correlation", 0.0),
+        "algo.actor.persistence": getattr(config.algo.actor, "persistence", 0.0),
+    }
+    for key, value in needing_memory.items():
+        if value:
+            raise ValueError(f"{key} is {value}: {task} does not show agents their previous action; it must be 0")
+    if config.algo.critic.mlp is not None:
+        raise ValueError(f"algo.critic.mlp: it reads the arm's observation, which {task} has not; it must be null")
 
 
 def _group_schemas() -> dict[str, dict[str, type]]:
     """Dataclass of every task, algorithm and model by name; imported late because it brings torch along."""
     from softgm_bench.algorithms import algorithm_configs
     from softgm_bench.envs.tasks import TASK_CONFIGS
+    from softgm_bench.envs.vmas import SCENARIOS, VmasConfig
     from softgm_bench.models.registry import model_configs
 
-    return {"task": TASK_CONFIGS, "algo": algorithm_configs(), "model": model_configs()}
+    tasks = {**TASK_CONFIGS, **dict.fromkeys(SCENARIOS, VmasConfig)}
+    return {"task": tasks, "algo": algorithm_configs(), "model": model_configs()}
 
 
 def _schema(cls: type) -> DictConfig:

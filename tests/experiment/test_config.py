@@ -158,10 +158,10 @@ def test_values_of_the_wrong_type_are_refused():
 
 
 def test_unknown_choices_list_the_known_ones():
-    tasks = "basic, structured, wall, wall_fixed, wall_narrow"
+    tasks = "basic, structured, vmas_balance, vmas_navigation, wall, wall_fixed, wall_narrow"
     assert refusal("task=wal") == f"task=wal: no such task; choose one of {tasks}"
     assert refusal("experiment=fast") == "experiment=fast: no such experiment; choose one of default, quick, smoke"
-    assert refusal("model=cnn") == "model=cnn: no such model; choose one of mlp, softgm"
+    assert refusal("model=cnn") == "model=cnn: no such model; choose one of mlp, softgm, vector_mlp"
     algorithms = ", ".join(sorted(algorithm_configs()))
     assert refusal("algo=ppo") == f"algo=ppo: no such algo; choose one of {algorithms}"
     assert refusal("recipe=best") == "recipe=best: no such recipe; choose one of open, paper"

@@ -14,6 +14,7 @@ from softgm_bench.algorithms.replay import Replay
 from softgm_bench.algorithms.team import give_to_agents
 from softgm_bench.algorithms.vector_replay import VectorReplay
 from softgm_bench.envs import SoftArmEnv, keys
+from softgm_bench.envs.vmas import VmasEnv
 from softgm_bench.models.action_value import ActionValueConfig
 from softgm_bench.models.heads import ACTIONS
 
@@ -252,8 +253,8 @@ class OffPolicy:
         raise NotImplementedError
 
 
-def _make_replay(capacity: int, env: SoftArmEnv, n_privileged: int) -> Replay | VectorReplay:
+def _make_replay(capacity: int, env: SoftArmEnv | VmasEnv, n_privileged: int) -> Replay | VectorReplay:
     """The memory that fits what the environment observes."""
-    if keys.SLOT_DESCRIPTOR in env.observation_spec.keys(True, True):
-        return Replay(capacity, env.batch_size[0], env.n_agents, env.n_slots, env.device, n_privileged)
-    return VectorReplay(capacity, env.device)
+    if isinstance(env, VmasEnv):
+        return VectorReplay(capacity, env.device)
+    return Replay(capacity, env.batch_size[0], env.n_agents, env.n_slots, env.device, n_privileged)

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
@@ -15,12 +15,24 @@ from softgm_bench.envs import keys
 from softgm_bench.rod.dense import dense
 
 DISCOUNT = 0.99  # of the returns that are reported, whatever an algorithm trains with
+# Of an episode, by name in its records: what is summed over its steps, of that what is divided by their number, what
+# happened at any of them, and what was the case at the last one.
+SUMMED = {
+    "discounted_return": keys.REWARD,
+    "undiscounted_return": keys.REWARD,
+    "tip_travel_distance": keys.TIP_STEP,
+    "torque_per_agent": keys.TORQUE_PER_AGENT,
+    "torque_joint": keys.TORQUE_JOINT,
+}
+AVERAGED = frozenset({"torque_per_agent", "torque_joint"})
+HAPPENED = {"success": keys.SUCCESS, "diverged": keys.DIVERGED}
+LAST = {"final_distance": keys.DISTANCE}
 LOOK_EVERY = 16  # steps between two looks at whether an episode goes on, on a device that a look waits for
 
 
 @dataclass(frozen=True)
 class EpisodeRecords:
-    """One entry per episode in every field, ``(episodes,)``.
+    """One entry per episode in every field, ``(episodes,)``; None what the task does not tell.
 
     Attributes:
         discounted_return: sum of gamma^t r_t.
@@ -37,16 +49,16 @@ class EpisodeRecords:
     discounted_return: NDArray[np.float64]
     undiscounted_return: NDArray[np.float64]
     length: NDArray[np.int64]
-    success: NDArray[np.bool_]
-    diverged: NDArray[np.bool_]
-    tip_travel_distance: NDArray[np.float64]
-    final_distance: NDArray[np.float64]
-    torque_per_agent: NDArray[np.float64]
-    torque_joint: NDArray[np.float64]
+    success: NDArray[np.bool_] | None = None
+    diverged: NDArray[np.bool_] | None = None
+    tip_travel_distance: NDArray[np.float64] | None = None
+    final_distance: NDArray[np.float64] | None = None
+    torque_per_agent: NDArray[np.float64] | None = None
+    torque_joint: NDArray[np.float64] | None = None
 
     def rows(self) -> list[dict[str, float | int]]:
         """One mapping per episode, of plain numbers."""
-        columns = {name: values.tolist() for name, values in asdict(self).items()}
+        columns = {name: values.tolist() for name, values in asdict(self).items() if values is not None}
         return [
             {"episode": index} | {name: values[index] for name, values in columns.items()}
             for index in range(len(self.length))
@@ -72,37 +84,37 @@ def evaluate(
 def _first_episodes(policy: TensorDictModuleBase, env: EnvBase, gamma: float) -> EpisodeRecords:
     data = env.reset()
     alive = torch.ones(env.batch_size, dtype=torch.bool, device=env.device)
-    summed = {
-        "discounted_return": keys.REWARD,
-        "undiscounted_return": keys.REWARD,
-        "tip_travel_distance": keys.TIP_STEP,
-        "torque_per_agent": keys.TORQUE_PER_AGENT,
-        "torque_joint": keys.TORQUE_JOINT,
-    }
-    sums = {name: torch.zeros(env.batch_size, dtype=torch.float64, device=env.device) for name in summed}
+    sums = {name: torch.zeros(env.batch_size, dtype=torch.float64, device=env.device) for name in SUMMED}
     length = torch.zeros(env.batch_size, dtype=torch.int64, device=env.device)
-    success, diverged = torch.zeros_like(alive), torch.zeros_like(alive)
-    distance = torch.zeros_like(sums["torque_joint"])
+    happened = {name: torch.zeros_like(alive) for name in HAPPENED}
+    last = {name: torch.zeros_like(sums["discounted_return"]) for name in LAST}
+    told: set[NestedKey] = set()
     discount, blind = 1.0, dense(alive.device)
     for step in itertools.count():
         if not (blind and step % LOOK_EVERY) and not alive.any():
             break
         data = env.step(_act(policy, data, alive))
         after = data["next"]
-        for name, key in summed.items():
+        told = told or set(after.keys(include_nested=True))
+        for name in [name for name in SUMMED if SUMMED[name] in told]:
             weight = discount if name == "discounted_return" else 1.0
-            sums[name] += torch.where(alive, weight * after[key].squeeze(-1).double(), 0.0)
+            sums[name] += torch.where(alive, weight * after[SUMMED[name]].squeeze(-1).double(), 0.0)
         length += alive
-        success |= alive & after[keys.SUCCESS].squeeze(-1)
-        diverged |= alive & after[keys.DIVERGED].squeeze(-1)
-        distance = torch.where(alive, after[keys.DISTANCE].squeeze(-1).double(), distance)
+        for name in [name for name in HAPPENED if HAPPENED[name] in told]:
+            happened[name] |= alive & after[HAPPENED[name]].squeeze(-1)
+        for name in [name for name in LAST if LAST[name] in told]:
+            last[name] = torch.where(alive, after[LAST[name]].squeeze(-1).double(), last[name])
         alive = alive & ~after[keys.DONE].squeeze(-1)
         discount *= gamma
         data = step_mdp(data)
-    for name in ("torque_per_agent", "torque_joint"):
+    for name in AVERAGED:
         sums[name] /= length
-    results = sums | {"length": length, "success": success, "diverged": diverged, "final_distance": distance}
-    return EpisodeRecords(**{name: value.cpu().numpy() for name, value in results.items()})
+    results = {
+        name: value.cpu().numpy()
+        for name, value in (sums | happened | last).items()
+        if (SUMMED | HAPPENED | LAST)[name] in told
+    }
+    return EpisodeRecords(length=length.cpu().numpy(), **results)
 
 
 def _act(policy: TensorDictModuleBase, data: TensorDictBase, alive: torch.Tensor) -> TensorDictBase:

@@ -52,7 +52,7 @@ class EpisodeTracker:
     def update(self, batch: TensorDictBase) -> dict[str, float | int]:
         """Statistics of the episodes that end within ``batch``, whose shape is ``(num_envs, steps)``.
 
-        Without any such episode the means are NaN.
+        Without any such episode the means are NaN. A task without a notion of success has none of that kind.
         """
         after = batch["next"]
         reward, done = after[keys.REWARD].squeeze(-1), after[keys.DONE].squeeze(-1)
@@ -64,14 +64,15 @@ class EpisodeTracker:
             lengths.append(self._length.clone())
             self._return[done[:, step]] = 0.0
             self._length[done[:, step]] = 0
-        success, diverged = (after[key].squeeze(-1)[done] for key in (keys.SUCCESS, keys.DIVERGED))
-        return {
+        row: dict[str, float | int] = {
             "episodes": int(done.sum()),
             "episode_return": torch.stack(returns, 1)[done].mean().item(),
             "episode_length": torch.stack(lengths, 1)[done].double().mean().item(),
-            "success_rate": success.double().mean().item(),
-            "diverged": int(diverged.sum()),
         }
+        if keys.SUCCESS in after.keys(include_nested=True):
+            success, diverged = (after[key].squeeze(-1)[done] for key in (keys.SUCCESS, keys.DIVERGED))
+            row |= {"success_rate": success.double().mean().item(), "diverged": int(diverged.sum())}
+        return row
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         """What the episodes under way have gathered."""
@@ -79,8 +80,10 @@ class EpisodeTracker:
 
 
 def step_metrics(batch: TensorDictBase) -> dict[str, float]:
-    """Means over all steps of a batch: every reward term, contact, sensing and torque."""
+    """Means over all steps of a batch: every reward term, contact, sensing and torque; of other tasks, the reward."""
     after = batch["next"]
+    if keys.REWARD_TERMS not in after.keys():  # noqa: SIM118
+        return {"reward": after[keys.REWARD].double().mean().item()}
     means = {f"reward_{name}": after[keys.REWARD_TERMS, name] for name in keys.REWARD_TERM_NAMES}
     means |= {
         "tip_distance": after[keys.DISTANCE],

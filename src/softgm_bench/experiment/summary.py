@@ -23,17 +23,22 @@ AVERAGED = {
 
 
 def summarise(records: EpisodeRecords) -> dict[str, Any]:
-    """Mean and standard deviation (over the episodes, population) of every metric; success rate with 95 % interval."""
-    episodes, successes = len(records.length), int(records.success.sum())
-    low, high = wilson_interval(successes, episodes)
-    metrics: dict[str, Any] = {
-        "episodes": episodes,
-        "success_rate": {"mean": successes / episodes, "low": low, "high": high},
-        "diverged": int(records.diverged.sum()),
-    }
+    """Mean and standard deviation (over the episodes, population) of every metric; success rate with 95 % interval.
+
+    What the records do not tell is absent.
+    """
+    episodes = len(records.length)
+    metrics: dict[str, Any] = {"episodes": episodes}
+    if records.success is not None:
+        successes = int(records.success.sum())
+        low, high = wilson_interval(successes, episodes)
+        metrics["success_rate"] = {"mean": successes / episodes, "low": low, "high": high}
+    if records.diverged is not None:
+        metrics["diverged"] = int(records.diverged.sum())
     for name, field in AVERAGED.items():
         values = getattr(records, field)
-        metrics[name] = {"mean": float(np.mean(values)), "std": float(np.std(values))}
+        if values is not None:
+            metrics[name] = {"mean": float(np.mean(values)), "std": float(np.std(values))}
     return metrics
 
 
@@ -54,12 +59,15 @@ def versions() -> dict[str, str]:
 
 def table(metrics: Mapping[str, Any], title: str) -> str:
     """The metrics of ``summarise`` for a reader."""
-    success = metrics["success_rate"]
-    rows = [("success rate", f"{success['mean']:.3f}  [{success['low']:.3f}, {success['high']:.3f}]")]
+    rows = []
+    if (success := metrics.get("success_rate")) is not None:
+        rows.append(("success rate", f"{success['mean']:.3f}  [{success['low']:.3f}, {success['high']:.3f}]"))
     rows += [
-        (name.replace("_", " "), f"{metrics[name]['mean']:.3f} +- {metrics[name]['std']:.3f}") for name in AVERAGED
+        (name.replace("_", " "), f"{metrics[name]['mean']:.3f} +- {metrics[name]['std']:.3f}")
+        for name in AVERAGED
+        if name in metrics
     ]
-    rows += [("diverged", str(metrics["diverged"])), ("episodes", str(metrics["episodes"]))]
+    rows += [(name, str(metrics[name])) for name in ("diverged", "episodes") if name in metrics]
     width = max(len(name) for name, _ in rows)
     lines = [f"  {name:<{width}}  {value}" for name, value in rows]
     return "\n".join([title, *lines])
