@@ -3,20 +3,14 @@ import dataclasses
 import pytest
 import torch
 from bandit import LEARNS_FAST, SIZES, error_after_learning
-from tensordict import TensorDict
-from torchrl.collectors import Collector
+from off_policy_cases import SHORT, SMALL, batches, filled, says, three_ends
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from softgm_bench.algorithms.ddpg import DDPG, DDPGConfig
 from softgm_bench.algorithms.off_policy import AGENT_REWARD
-from softgm_bench.algorithms.registry import algorithm_configs
 from softgm_bench.envs import keys, make_env
 from softgm_bench.models.action_value import ACTION_VALUE
 from softgm_bench.models.mlp import MLPConfig
-from softgm_bench.rod.parameters import RodParameters
-
-SHORT = RodParameters(substeps=5)
-SMALL = ("algo.batch_size=16", "algo.replay_capacity=200", "algo.random_frames=0", "algo.updates_per_frame=0.1")
 
 
 @pytest.fixture(autouse=True)
@@ -37,45 +31,6 @@ def build(settings):
         return DDPG(config.algo, config.model, env), env
 
     return algorithm
-
-
-def batches(algorithm, env, count=1, steps=8):
-    collector = Collector(
-        env,
-        algorithm.policy,
-        frames_per_batch=env.batch_size[0] * steps,
-        total_frames=count * env.batch_size[0] * steps,
-        exploration_type=ExplorationType.RANDOM,
-    )
-    yield from collector
-    collector.shutdown()
-
-
-def filled(algorithm, env):
-    (batch,) = batches(algorithm, env)
-    algorithm.replay.add(batch)
-    return algorithm
-
-
-def says(parameters, value):
-    """Make a network with these parameters say ``value`` whatever it reads: all zero but the last bias."""
-    leaves = [parameter.data for parameter in parameters]
-    for leaf in leaves:
-        leaf.zero_()
-    leaves[-1].fill_(value)
-
-
-def three_ends(algorithm):
-    """Rewards 1, 3, 5 in a frame that goes on, one that is truncated and one that is terminated."""
-    transitions = algorithm.sample()[:3]
-    column = (3, 1, 1)
-    for name, values in {
-        "reward": [1.0, 3.0, 5.0],
-        "done": [False, True, True],
-        "terminated": [False, False, True],
-    }.items():
-        transitions["next", "agents", name] = torch.tensor(values).view(column).expand(3, algorithm.n_agents, 1).clone()
-    return transitions
 
 
 @pytest.mark.parametrize("name", ["iddpg", "maddpg"])
@@ -209,22 +164,6 @@ def test_an_update_moves_actor_critic_and_target_on_every_model(build, name, mod
     }
 
 
-def test_an_algorithm_goes_on_bit_for_bit_from_its_saved_state(build):
-    algorithm, env = build("maddpg", "algo.checkpoint_replay=true")
-    first, second = batches(algorithm, env, count=2)
-    algorithm.update(first)
-    saved = copied(algorithm.state_dict())
-    other, _ = build("maddpg", "algo.checkpoint_replay=true")
-    other.load_state_dict(saved)
-
-    def proceed(one):
-        torch.manual_seed(5)
-        return one.update(second)
-
-    assert proceed(algorithm) == proceed(other)
-    assert other.policy.sigma == algorithm.policy.sigma
-
-
 def test_without_the_replay_an_algorithm_waits_for_new_frames(build):
     algorithm, env = build("iddpg", "algo.random_frames=40")
     one, two, three, four = batches(algorithm, env, count=4)
@@ -238,24 +177,12 @@ def test_without_the_replay_an_algorithm_waits_for_new_frames(build):
     assert [other.update(batch)["gradient_steps"] for batch in (three, four)] == [0.0, 3.0]
 
 
-def copied(value):
-    if isinstance(value, dict):
-        return {name: copied(item) for name, item in value.items()}
-    return value.clone() if isinstance(value, torch.Tensor | TensorDict) else value
-
-
 @pytest.mark.parametrize("name", ["iddpg", "maddpg"])
 def test_it_learns_what_each_agent_should_do(settings, name):
     config = dataclasses.replace(settings(f"algo={name}").algo, **LEARNS_FAST, initial_sigma=0.5, final_sigma=0.5)
     torch.manual_seed(0)
     algorithm = DDPG(config, MLPConfig(hidden=32, layers=2, velocity_scale=1.0), SIZES)
     assert error_after_learning(algorithm, 32 + 60) < 0.02
-
-
-def test_names_mean_the_switch(settings):
-    assert algorithm_configs()["iddpg"] is algorithm_configs()["maddpg"] is DDPGConfig
-    assert not settings("algo=iddpg").algo.centralised
-    assert settings("algo=maddpg").algo.centralised
 
 
 @pytest.mark.parametrize(

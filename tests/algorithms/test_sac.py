@@ -4,11 +4,11 @@ import math
 import pytest
 import torch
 from bandit import LEARNS_FAST, SIZES, error_after_learning
-from test_ddpg import SHORT, SMALL, actions, batches, copied, filled, observe, says, three_ends
+from off_policy_cases import SHORT, SMALL, batches, filled, says, three_ends
+from test_ddpg import actions, observe
 from torchrl.envs.utils import ExplorationType
 
-from softgm_bench.algorithms.registry import algorithm_configs
-from softgm_bench.algorithms.sac import SAC, SACConfig
+from softgm_bench.algorithms.sac import SAC
 from softgm_bench.envs import keys, make_env
 from softgm_bench.models.heads import LOC
 from softgm_bench.models.mlp import MLPConfig
@@ -168,30 +168,9 @@ def test_an_update_moves_actor_critics_targets_and_temperature_on_every_model(bu
     }
 
 
-def test_an_algorithm_goes_on_bit_for_bit_from_its_saved_state(build):
-    algorithm, env = build("masac", "algo.checkpoint_replay=true")
-    first, second = batches(algorithm, env, count=2)
-    algorithm.update(first)
-    saved = copied(algorithm.state_dict())
-    other, _ = build("masac", "algo.checkpoint_replay=true")
-    other.load_state_dict(saved)
-
-    def proceed(one):
-        torch.manual_seed(5)
-        return one.update(second)
-
-    assert proceed(algorithm) == proceed(other)
-
-
 @pytest.mark.parametrize("name", ["isac", "masac"])
 def test_it_learns_what_each_agent_should_do(settings, name):
     config = dataclasses.replace(settings(f"algo={name}").algo, **LEARNS_FAST, alpha_lr=3e-3, initial_alpha=0.05)
     torch.manual_seed(0)
     algorithm = SAC(config, MLPConfig(hidden=32, layers=2, velocity_scale=1.0), SIZES)
     assert error_after_learning(algorithm, 32 + 40) < 0.02
-
-
-def test_names_mean_the_switch(settings):
-    assert algorithm_configs()["isac"] is algorithm_configs()["masac"] is SACConfig
-    assert not settings("algo=isac").algo.centralised
-    assert settings("algo=masac").algo.centralised
