@@ -87,12 +87,16 @@ class Config:
     @property
     def label(self) -> str:
         """The algorithm's name as results carry it."""
-        return labelled(self.algo.name, self.observation)
+        return labelled(self.algo.name, plain(self)["model"]["name"], self.observation)
 
 
-def labelled(algo: str, observation: str) -> str:
-    """``algo``, and whatever in the observation makes its results another kind's."""
-    return algo if observation == "standard" else f"{algo}_{observation}"
+def labelled(algo: str, model: str, observation: str) -> str:
+    """``algo``, and whatever in model and observation makes its results another kind's.
+
+    SoftGM and its ablations have the model that they are named after, the other algorithms an MLP; another one is named.
+    """
+    own = "softgm" if algo.startswith("softgm") else "mlp"
+    return "_".join([algo, *([] if model == own else [model]), *([] if observation == "standard" else [observation])])
 
 
 # For conf/config.yaml: the run folder's name.
@@ -131,6 +135,8 @@ def typed(composed: DictConfig) -> Config:
     """Hold a composed configuration against the dataclasses and make instances of them."""
     schema, values = _schema(Config), composed.copy()
     OmegaConf.set_struct(values, False)
+    if "run_dir" in composed:
+        values.run_dir = composed.run_dir  # which may name the model, as the key that goes below
     for group, schemas in _group_schemas().items():
         name = OmegaConf.select(composed, f"{group}.name")
         if name not in schemas:

@@ -56,6 +56,18 @@ def test_what_the_command_line_says_comes_after_the_recipe_and_the_recipe_after_
     assert compose([*overrides, "algo.gamma=0.9"]).algo.gamma == 0.9
 
 
+@pytest.mark.parametrize("recipe", ["paper", "open"])
+@pytest.mark.parametrize("algo", algorithm_configs())
+def test_a_smoke_run_is_small_and_takes_gradient_steps_whatever_the_recipe(algo, recipe):
+    config = compose([f"algo={algo}", f"recipe={recipe}", "experiment=smoke"])
+    frames = config.experiment.num_envs * config.experiment.steps_per_batch
+    assert frames <= 128
+    if hasattr(config.algo, "random_frames"):
+        learning = config.experiment.total_frames - max(config.algo.random_frames, frames)
+        assert learning * config.algo.updates_per_frame >= 2
+        assert config.algo.batch_size <= frames
+
+
 def test_softgm_is_ppo_with_the_papers_settings():
     config = compose([])
     algo, model = config.algo, config.model
@@ -96,6 +108,19 @@ def test_a_linear_schedule_lasts_as_long_as_the_run_unless_told_otherwise():
     assert compose(["algo.lr_schedule_frames=5"]).algo.lr_schedule_frames == 5
     refused = "algo.lr_schedule_frames is 0: it must be at least 1"
     assert refusal("algo.lr_schedule=linear", "algo.lr_schedule_frames=0") == refused
+
+
+def test_another_model_than_an_algorithms_own_is_named_in_folder_and_label():
+    for algo, model, name in (
+        ("softgm", "softgm", "softgm"),
+        ("softgm_no_stage1", "softgm", "softgm_no_stage1"),
+        ("softgm", "mlp", "softgm_mlp"),
+        ("masac", "mlp", "masac"),
+        ("masac", "softgm", "masac_softgm"),
+    ):
+        config = compose([f"algo={algo}", f"model={model}"])
+        assert config.label == name
+        assert config.run_dir == f"outputs/basic/{name}/seed0"
 
 
 def test_an_oracle_says_so_wherever_its_results_go():
