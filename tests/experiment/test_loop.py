@@ -1,5 +1,7 @@
 import csv
 import json
+import subprocess
+import sys
 
 import numba
 import pytest
@@ -136,6 +138,13 @@ def test_derived_seeds_share_nothing_and_repeat():
 
 def test_threads_are_set_everywhere():
     assert set_threads(1) == torch.get_num_threads() == numba.get_num_threads() == 1
+
+
+def test_a_fresh_process_uses_the_threads_that_it_is_told_to():
+    """Numba starts its threads when it is first asked for some, and tells torch how many."""
+    code = "import torch; from softgm_bench.experiment.loop import set_threads; set_threads(1)"
+    command = [sys.executable, "-c", f"{code}; print(torch.get_num_threads())"]
+    assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == "1\n"
 
 
 def test_a_curriculum_is_followed_in_training_and_shown(tmp_path):

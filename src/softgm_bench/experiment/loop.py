@@ -112,8 +112,9 @@ def set_threads(threads: int | None) -> int:
     Matrix products on the CPU go to oneDNN. The package's ``__init__`` says why, and why they stay float32.
     """
     count = threads or available_threads()
-    torch.set_num_threads(count)
+    # Numba first: when it starts its threads, it sets OpenMP's number of them, which is torch's too
     numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))
+    torch.set_num_threads(count)
     torch.backends.mkldnn.matmul.fp32_precision = "bf16"  # type: ignore[attr-defined]
     return count
 
