@@ -27,13 +27,14 @@ check: setup
 	$(BIN)/mypy
 
 # Speed: rod and environment steps against PyElastica, distance to the roofline, scaling; SoftGM against
-# torch_geometric. About seven minutes.
+# torch_geometric, the whole training loop. About fifteen minutes.
 bench: setup
 	$(BIN)/python benchmarks/bench_rod.py
 	$(BIN)/python benchmarks/roofline.py
 	$(BIN)/python benchmarks/bench_env.py
 	$(BIN)/python benchmarks/bench_scaling.py
 	$(BIN)/python benchmarks/bench_models.py
+	$(BIN)/python benchmarks/bench_training.py
 
 # The same on an NVIDIA GPU.
 bench-gpu: setup

@@ -26,7 +26,7 @@ ALGORITHMS = ("softgm", "ippo", "mappo", "iddpg", "maddpg", "isac", "masac")
 OFF_POLICY = ("iddpg", "maddpg", "isac", "masac")
 TASKS = ("basic", "structured", "wall")
 PARTS = ("simulator", "policy", "update", "framework")
-FRAMES = 25_600  # at least so many between two looks at the clock, of PPO; a tenth of it off-policy
+FRAMES = 12_800  # at least so many between two looks at the clock, of PPO; a tenth of it off-policy
 
 
 def measure(algo: str, task: str, repetitions: int) -> dict[str, Any]:
@@ -77,7 +77,7 @@ def measure(algo: str, task: str, repetitions: int) -> dict[str, Any]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--repetitions", type=int, default=3)
+    parser.add_argument("--repetitions", type=int, default=2)
     parser.add_argument("--algorithms", nargs="+", default=ALGORITHMS)
     parser.add_argument("--tasks", nargs="+", default=TASKS)
     parser.add_argument("--output", type=Path, default=Path("benchmarks/results/training.json"))
