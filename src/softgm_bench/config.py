@@ -93,7 +93,7 @@ class Config:
 def labelled(algo: str, model: str, observation: str) -> str:
     """``algo``, and whatever in model and observation makes its results another kind's.
 
-    SoftGM and its ablations have the model that they are named after, the other algorithms an MLP; another one is named.
+    SoftGM and its ablations have the model that they are named after, the other algorithms an MLP; any other is named.
     """
     own = "softgm" if algo.startswith("softgm") else "mlp"
     return "_".join([algo, *([] if model == own else [model]), *([] if observation == "standard" else [observation])])

@@ -1,8 +1,8 @@
 """A curriculum over a task's scenes, gated by success; for training environments only.
 
 Difficulty rises in ``stages`` equal steps from 0, the easiest scenes, to 1, the task's own. All environments of one
-object share the stage. It moves after a round, in which every environment counts its first episodes of that round and
-no others: a window over the episodes that end first would hold the quick ones, which are successes.
+object share the stage. It moves after a round, of which every environment counts its first episodes and no others: a
+window over the episodes that end first would hold the quick ones, which are successes.
 
 A round can end in any step, and nothing here looks at values: see ``softgm_bench.rod.dense``.
 """
@@ -48,10 +48,11 @@ def difficulty(progress: Progress, config: CurriculumConfig) -> Tensor:
 
 
 def note_ends(progress: Progress, ended: Tensor, success: Tensor, config: CurriculumConfig) -> Progress:
-    """Count the episodes that have just ended and, when that completes the round, decide on the stage.
+    """Count the episodes that have just ended and, when that settles the round, decide on the stage.
 
     A round has at least ``episodes`` episodes, equally many of every environment. The stage rises by one if a larger
-    share of them than ``promote`` were successes, and falls by one if a smaller share than ``demote`` were.
+    share of them than ``promote`` are successes, and falls by one if a smaller share than ``demote`` are. The round is
+    over as soon as the episodes under way cannot change that any more: it need not wait for the longest failures.
 
     Args:
         progress: not changed.
@@ -63,14 +64,17 @@ def note_ends(progress: Progress, ended: Tensor, success: Tensor, config: Curric
     counts = ended & progress.counting & (progress.counted < quota)
     counted = progress.counted + counts
     succeeded = progress.succeeded + (counts & success)
-    complete = (counted >= quota).all()
-    share = succeeded.sum().to(torch.float64) / (quota * len(ended))
-    change = (complete & (share > config.promote)).long() - (complete & (share < config.demote)).long()
+    total = quota * len(ended)
+    won = succeeded.sum().to(torch.float64)
+    open_still = (total - counted.sum()).to(torch.float64)
+    rises, falls = won / total > config.promote, (won + open_still) / total < config.demote
+    over = rises | falls | (open_still == 0)
+    change = rises.long() - falls.long()
     return Progress(
         stage=(progress.stage + change).clamp(0, config.stages),
         # what is under way when a round begins has lasted long already: more often a failure than not
-        counting=progress.counting & ~complete,
-        counted=counted * ~complete,
-        succeeded=succeeded * ~complete,
+        counting=progress.counting & ~over,
+        counted=counted * ~over,
+        succeeded=succeeded * ~over,
         batch_size=progress.batch_size,
     )
