@@ -12,7 +12,7 @@ import matplotlib.pyplot as plt
 
 
 def main(run: Path, picture: Path) -> None:
-    """Success in training (running mean over iterations) and in evaluations, and the tip's distance, against frames."""
+    """Success in training (running mean over iterations) and in evaluations, and episodes' lengths, against frames."""
     with (run / "metrics.csv").open() as file:
         rows = list(csv.DictReader(file))
     evaluations = [json.loads(line) for line in (run / "evaluations.jsonl").read_text().splitlines()]
@@ -39,8 +39,8 @@ def main(run: Path, picture: Path) -> None:
     )
     left.set(xlabel="frames / 1000", ylabel="success rate", ylim=(-0.02, 1.02))
     left.legend(frameon=False, fontsize=8)
-    right.plot(frames, [float(row["tip_distance"]) for row in rows], color="C0")
-    right.set(xlabel="frames / 1000", ylabel="mean distance tip to target, m", ylim=(0, None))
+    right.plot(frames, running([float(row["episode_length"]) for row in rows], 10), color="0.6")
+    right.set(xlabel="frames / 1000", ylabel="control steps of a training episode", ylim=(0, None))
     for axes in (left, right):
         axes.spines[["top", "right"]].set_visible(False)
     figure.suptitle(f"{summary['algo']} on {summary['task']}, seed {summary['seed']}", fontsize=10)
