@@ -46,6 +46,14 @@ def test_every_algorithm_has_both_recipes(algo, recipe):
     assert config.model.velocity_scale == {"paper": 1.0, "open": 0.2}[recipe]
 
 
+def test_only_the_open_recipe_has_what_walls_need_and_only_on_walls():
+    for task in ("basic", "structured", "wall", "wall_narrow", "wall_fixed"):
+        for recipe in ("paper", "open"):
+            config = compose([f"task={task}", f"recipe={recipe}"])
+            expected = recipe == "open" and task.startswith("wall")
+            assert config.task.curriculum.enabled is config.algo.critic.asymmetric is expected
+
+
 def test_what_the_command_line_says_comes_after_the_recipe_and_the_recipe_after_the_experiment():
     overrides = ["algo=masac", "experiment=quick", "recipe=open"]
     assert (
