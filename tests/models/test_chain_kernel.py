@@ -21,7 +21,7 @@ def test_its_gradient_is_right(n_agents):
     assert torch.autograd.gradcheck(of_new_agents, values(3, n_agents).requires_grad_())
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(st.integers(1, 9), st.integers(1, 8), st.integers(0, 2**31), st.sampled_from([torch.float32, torch.float64]))
 def test_it_equals_the_tensor_operations_forward_and_backward(graphs, n_agents, seed, dtype):
     layer = GraphAttention(4, HEADS * CHANNELS, HEADS, gatv2=False).to(dtype)
@@ -34,9 +34,10 @@ def test_it_equals_the_tensor_operations_forward_and_backward(graphs, n_agents, 
         out, weights = layer.chain(layer.project(inputs, layer.joint_weight(), receives=True), n_agents)
         (out * torch.arange(1.0, 1.0 + out.shape[1], dtype=dtype)).square().sum().backward()
         results.append([out, weights, inputs.grad, *(parameter.grad.clone() for parameter in layer.parameters())])
+    # small gradients are sums of large terms, so that rounding goes with the largest number anywhere
+    scale = max(1.0, *(plain.abs().max().item() for plain in results[1]))
     for compiled, plain in zip(*results, strict=True):
-        scale = max(1.0, plain.abs().max().item())
-        torch.testing.assert_close(compiled, plain, rtol=0.0, atol=100 * torch.finfo(dtype).eps * scale)
+        torch.testing.assert_close(compiled, plain, rtol=0.0, atol=50 * torch.finfo(dtype).eps * scale)
 
 
 def test_the_layer_takes_the_kernel_on_a_cpu_and_only_for_the_papers_scores(monkeypatch):
