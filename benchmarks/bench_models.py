@@ -2,7 +2,8 @@
 
 ``python benchmarks/bench_models.py`` prints milliseconds of one forward pass, and of forward and backward, over a batch
 of observations with none, some and all obstacle slots discovered. torch_geometric gets the paper's graph as one large
-batch of nodes (agents and discovered slots) and edge lists; building both is part of its time, as it is of ours.
+batch of nodes (agents and discovered slots) and edge lists; building both is part of its time, as it is of ours. Matrix
+products and memory are set as in training, for all three.
 """
 
 import argparse
@@ -23,6 +24,7 @@ from observations import observation
 
 from softgm_bench.config import compose
 from softgm_bench.envs import keys
+from softgm_bench.experiment.loop import keep_memory, set_threads
 from softgm_bench.models import build_encoder, graph
 from softgm_bench.models.softgm import SoftGMConfig
 
@@ -88,7 +90,8 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=1600)
     parser.add_argument("--output", type=Path, default=Path("benchmarks/results/models.json"))
     options = parser.parse_args()
-    torch.set_num_threads(options.threads)
+    set_threads(options.threads)
+    keep_memory()
     torch.manual_seed(0)
 
     config = compose(["algo=softgm"]).model
