@@ -21,3 +21,12 @@ def settings():
         return known[overrides]
 
     return build
+
+
+@pytest.fixture
+def one_thread():
+    """For tests whose tensors are so small that a second thread would only be waited for."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)

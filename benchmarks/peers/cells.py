@@ -1,5 +1,6 @@
 """What is compared: every algorithm on every task with every seed, in both frameworks. Needs no package."""
 
+import argparse
 import csv
 import itertools
 from collections.abc import Iterable
@@ -43,6 +44,17 @@ def cells(
         Cell(framework, algo, task, seed)
         for seed, task, algo, framework in itertools.product(seeds, tasks, algorithms, FRAMEWORKS)
     ]
+
+
+def asked_for(framework: str, description: str | None) -> tuple[Cell, int]:
+    """The cell that the command line names, and how many threads to use."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("algo", choices=ALGORITHMS)
+    parser.add_argument("task", choices=TASKS)
+    parser.add_argument("seed", type=int)
+    parser.add_argument("--threads", type=int, default=1)
+    arguments = parser.parse_args()
+    return Cell(framework, arguments.algo, arguments.task, arguments.seed), arguments.threads
 
 
 def write(cell: Cell, rows: Iterable[tuple[int, float, float]]) -> None:

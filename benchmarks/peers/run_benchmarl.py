@@ -1,6 +1,5 @@
 """One training run with BenchMARL, in the virtual environment that ``make peers-setup`` makes."""
 
-import argparse
 import math
 import sys
 import tempfile
@@ -12,7 +11,7 @@ from benchmarl.algorithms import algorithm_config_registry
 from benchmarl.environments.vmas.common import VmasClass
 from benchmarl.experiment import Callback, Experiment, ExperimentConfig
 from benchmarl.models.mlp import MlpConfig
-from cells import ALGORITHMS, HERE, TASKS, Cell, write
+from cells import HERE, Cell, asked_for, write
 from tensordict import TensorDictBase
 from torch import nn
 from torchrl.envs import Transform
@@ -122,14 +121,8 @@ def _number(value):
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("algo", choices=ALGORITHMS)
-    parser.add_argument("task", choices=TASKS)
-    parser.add_argument("seed", type=int)
-    parser.add_argument("--threads", type=int, default=1)
-    arguments = parser.parse_args()
-    torch.set_num_threads(arguments.threads)
-    cell = Cell("benchmarl", arguments.algo, arguments.task, arguments.seed)
+    cell, threads = asked_for("benchmarl", __doc__)
+    torch.set_num_threads(threads)
     record = Record()
     with tempfile.TemporaryDirectory() as folder:
         experiment = make_experiment(cell, folder, record)

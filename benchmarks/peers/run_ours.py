@@ -1,6 +1,5 @@
 """One training run with softgm_bench, in its own virtual environment: ``pip install -e '.[vmas]'``."""
 
-import argparse
 import csv
 import json
 import sys
@@ -8,7 +7,7 @@ import tempfile
 from pathlib import Path
 
 import yaml
-from cells import ALGORITHMS, HERE, TASKS, Cell, write
+from cells import HERE, Cell, asked_for, write
 
 from softgm_bench.config import compose
 from softgm_bench.experiment.loop import train
@@ -87,15 +86,9 @@ def rows(run_dir: Path) -> list[tuple[int, float, float]]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("algo", choices=ALGORITHMS)
-    parser.add_argument("task", choices=TASKS)
-    parser.add_argument("seed", type=int)
-    parser.add_argument("--threads", type=int, default=1)
-    arguments = parser.parse_args()
-    cell = Cell("softgm_bench", arguments.algo, arguments.task, arguments.seed)
+    cell, threads = asked_for("softgm_bench", __doc__)
     with tempfile.TemporaryDirectory() as folder:
-        train(compose(overrides(cell, folder, arguments.threads)))
+        train(compose(overrides(cell, folder, threads)))
         write(cell, rows(Path(folder)))
 
 

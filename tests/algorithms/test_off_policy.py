@@ -8,14 +8,7 @@ from softgm_bench.algorithms.registry import algorithm_configs
 from softgm_bench.algorithms.sac import SACConfig
 from softgm_bench.envs import make_env
 
-
-@pytest.fixture(autouse=True)
-def _one_thread():
-    """These tensors are so small that a second thread would only be waited for."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.mark.parametrize("name", ["iddpg", "maddpg", "isac", "masac"])

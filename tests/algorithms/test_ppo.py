@@ -10,17 +10,10 @@ from softgm_bench.envs import keys, make_env
 from softgm_bench.models.heads import STATE_VALUE
 from softgm_bench.rod.parameters import RodParameters
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 SHORT = RodParameters(substeps=5)
 NAMES = pytest.mark.parametrize("name", ["softgm", "ippo", "mappo"])
-
-
-@pytest.fixture(autouse=True)
-def _one_thread():
-    """These tensors are so small that a second thread would only be waited for."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture

@@ -10,17 +10,10 @@ from softgm_bench.algorithms.replay import FRAMES_PER_EPISODE, Replay
 from softgm_bench.envs import keys, make_env
 from softgm_bench.rod.parameters import RodParameters
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 SAMPLED = (*keys.OBSERVATION, keys.ACTION)
 SAMPLED_NEXT = (*keys.OBSERVATION, keys.REWARD, keys.DONE, keys.TERMINATED)
-
-
-@pytest.fixture(autouse=True)
-def _one_thread():
-    """These tensors are so small that a second thread would only be waited for."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 class Stream:

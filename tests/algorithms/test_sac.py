@@ -13,14 +13,7 @@ from softgm_bench.envs import keys, make_env
 from softgm_bench.models.heads import LOC
 from softgm_bench.models.mlp import MLPConfig
 
-
-@pytest.fixture(autouse=True)
-def _one_thread():
-    """These tensors are so small that a second thread would only be waited for."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture

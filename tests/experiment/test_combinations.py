@@ -49,13 +49,7 @@ TINY_OFF_POLICY = (
     "algo.replay_capacity=32",
 )
 
-
-@pytest.fixture(autouse=True)
-def _one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def check_run(folder, algo, *overrides):
