@@ -1,0 +1,80 @@
+"""What the commands beside training share: ``SOURCE key=value ...``, and one line for what a user can put right."""
+
+import os
+import sys
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+from typing import TypeVar, cast
+
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from softgm_bench.config import UserError
+from softgm_bench.experiment.explain import USER_ERRORS, explain
+
+Options = TypeVar("Options")
+
+
+def run(name: str, text: str | None, body: Callable[[list[str]], None]) -> int:
+    """Call ``body`` with the command line's arguments.
+
+    Args:
+        name: of the module under ``softgm_bench``.
+        text: of ``--help``.
+        body: does the work; raises what ``USER_ERRORS`` lists for what the user can put right.
+
+    Returns:
+        The exit status: 0; 2 after one line about what is wrong; 130 when interrupted.
+    """
+    arguments = sys.argv[1:]
+    if {"-h", "--help"} & set(arguments):
+        print((text or "").strip())
+        return 0
+    try:
+        body(arguments)
+    except USER_ERRORS as error:
+        if os.environ.get("HYDRA_FULL_ERROR") == "1":
+            raise
+        print(f"softgm_bench.{name}: {explain(error, arguments)}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f"softgm_bench.{name}: interrupted", file=sys.stderr)
+        return 130
+    return 0
+
+
+def parse(
+    arguments: list[str], options: type[Options], source: str, *, others: bool = False
+) -> tuple[Path, Options, list[str]]:
+    """Split a command line.
+
+    Args:
+        arguments: one path and settings.
+        options: dataclass of the command's own settings, each with a default.
+        source: what the path is, for the message when it is missing.
+        others: whether settings that are not the command's own are returned, for the configuration of a policy.
+
+    Returns:
+        The path, the options, and the other settings as they were written.
+
+    Raises:
+        UserError: no path or several, an unknown setting, or a value of the wrong type.
+    """
+    paths = [argument for argument in arguments if "=" not in argument or Path(argument).exists()]
+    if len(paths) != 1 or paths[0].startswith("-"):
+        found = f"found {', '.join(paths)}" if paths else "found none"
+        raise UserError(f"give one {source}, {found}; settings are written key=value, --help lists them")
+    names = [field.name for field in fields(options)]  # type: ignore[arg-type]
+    own: list[str] = []
+    rest: list[str] = []
+    for argument in arguments:
+        if argument not in paths:
+            (own if argument.partition("=")[0] in names else rest).append(argument)
+    if rest and not others:
+        raise UserError(f"{rest[0].partition('=')[0]}: no such setting; choose from {', '.join(names)}")
+    try:
+        merged = OmegaConf.merge(OmegaConf.structured(options), OmegaConf.from_dotlist(own))
+    except OmegaConfBaseException as error:
+        raise UserError(f"{error.full_key}: {str(error).splitlines()[0]}") from error
+    return Path(paths[0]), cast(Options, OmegaConf.to_object(merged)), rest
