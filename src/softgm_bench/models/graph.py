@@ -1,4 +1,4 @@
-"""From the observation to the paper's graph and to the flat view of an MLP: pure functions, two views of one content.
+"""From the observation to the paper's graph: pure functions.
 
 Shapes: ``...`` are any leading batch dimensions (time, environment), N agents, M obstacle slots. The node order is the
 paper's: the N agents first, then the M slots. Contract with the environment: an edge exists only from an active slot.
@@ -11,40 +11,38 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from softgm_bench.envs import keys
+from softgm_bench.envs.views import (
+    CHANNELS,
+    agent_channels,
+    flat_features,
+    flat_observation,
+    obstacle_channels,
+    slot_channels,
+)
 
-NODE_FEATURES = 22  # the paper's x_v
-CHANNELS = 15  # of which the last 7 are reserved zeros for every node type
+NODE_FEATURES = 22  # the paper's x_v, of which the last 7 are reserved zeros for every node type
 AGENT, OBSTACLE, PAD = 0, 1, 2  # node types
 
-
-def agent_channels(td: TensorDictBase, velocity_scale: float = 1.0) -> Tensor:
-    """The agents' features without the reserved zeros, ``(..., N, 15)``.
-
-    In order: position, velocity, previous action (tangential zero, normal, binormal), target - position,
-    tip - position. The velocity is multiplied by ``velocity_scale``; 1 is the paper.
-    """
-    position, velocity, action = td[keys.AGENT_POSITION], td[keys.AGENT_VELOCITY], td[keys.PREVIOUS_ACTION]
-    target, tip = td[keys.TARGET].unsqueeze(-2), td[keys.TIP].unsqueeze(-2)
-    tangential = action.new_zeros(()).expand(*action.shape[:-1], 1)
-    if velocity_scale != 1.0:
-        velocity = velocity * velocity_scale
-    return torch.cat([position, velocity, tangential, action, target - position, tip - position], dim=-1)
-
-
-def slot_channels(td: TensorDictBase) -> Tensor:
-    """The slots' features without the reserved zeros, ``(..., M, 15)``; an inactive slot (PAD) is exactly zero.
-
-    In order: centre, axis, (radius, length, normalised axial position), target - centre, tip - centre.
-    """
-    descriptor, active = td[keys.SLOT_DESCRIPTOR], td[keys.SLOT_ACTIVE].unsqueeze(-1)
-    target, tip = td[keys.TARGET].unsqueeze(-2), td[keys.TIP].unsqueeze(-2)
-    return torch.where(active, obstacle_channels(descriptor, target, tip), 0.0)
-
-
-def obstacle_channels(descriptor: Tensor, target: Tensor, tip: Tensor) -> Tensor:
-    """Features of obstacle nodes from descriptors ``(..., 9)`` and targets and tips that broadcast to ``(..., 3)``."""
-    centre = descriptor[..., :3]
-    return torch.cat([descriptor, target - centre, tip - centre], dim=-1)
+__all__ = [  # with the views, so that models name one module
+    "AGENT",
+    "CHANNELS",
+    "NODE_FEATURES",
+    "OBSTACLE",
+    "PAD",
+    "Sensed",
+    "agent_channels",
+    "agent_features",
+    "chain_adjacency",
+    "flat_features",
+    "flat_observation",
+    "full_adjacency",
+    "node_types",
+    "obstacle_channels",
+    "pad_channels",
+    "sense",
+    "slot_channels",
+    "slot_features",
+]
 
 
 def agent_features(td: TensorDictBase) -> Tensor:
@@ -83,22 +81,6 @@ def full_adjacency(td: TensorDictBase) -> Tensor:
     adjacency[..., :n_agents, :n_agents] = chain_adjacency(n_agents, edge.device)
     adjacency[..., :n_agents, n_agents:] = edge
     return adjacency
-
-
-def flat_observation(td: TensorDictBase) -> Tensor:
-    """What an MLP reads, per agent, ``(..., N, F)`` with F = ``flat_features(M)``: the same content as the graph.
-
-    In order: the agent's own 15 channels, the 15 channels of slot 0, 1, .., M - 1, the agent's own row of M sensed
-    edges as 0 or 1. The 7 reserved zeros of each node carry nothing and are left out.
-    """
-    own, slots = agent_channels(td), slot_channels(td)
-    shared = slots.flatten(-2).unsqueeze(-2).expand(*own.shape[:-1], -1)
-    return torch.cat([own, shared, td[keys.EDGE].to(own.dtype)], dim=-1)
-
-
-def flat_features(n_slots: int) -> int:
-    """Length of one agent's flat observation."""
-    return CHANNELS + n_slots * (CHANNELS + 1)
 
 
 def pad_channels(channels: Tensor) -> Tensor:

@@ -1,0 +1,58 @@
+"""The observation as features of agents and slots, and as the flat view of an MLP: pure functions of its entries.
+
+Shapes: ``...`` are any leading batch dimensions (time, environment), N agents, M obstacle slots.
+"""
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from softgm_bench.envs import keys
+
+CHANNELS = 15  # of an agent or a slot, without the paper's reserved zeros
+
+
+def agent_channels(td: TensorDictBase, velocity_scale: float = 1.0) -> Tensor:
+    """The agents' features without the reserved zeros, ``(..., N, 15)``.
+
+    In order: position, velocity, previous action (tangential zero, normal, binormal), target - position,
+    tip - position. The velocity is multiplied by ``velocity_scale``; 1 is the paper.
+    """
+    position, velocity, action = td[keys.AGENT_POSITION], td[keys.AGENT_VELOCITY], td[keys.PREVIOUS_ACTION]
+    target, tip = td[keys.TARGET].unsqueeze(-2), td[keys.TIP].unsqueeze(-2)
+    tangential = action.new_zeros(()).expand(*action.shape[:-1], 1)
+    if velocity_scale != 1.0:
+        velocity = velocity * velocity_scale
+    return torch.cat([position, velocity, tangential, action, target - position, tip - position], dim=-1)
+
+
+def slot_channels(td: TensorDictBase) -> Tensor:
+    """The slots' features without the reserved zeros, ``(..., M, 15)``; an inactive slot (PAD) is exactly zero.
+
+    In order: centre, axis, (radius, length, normalised axial position), target - centre, tip - centre.
+    """
+    descriptor, active = td[keys.SLOT_DESCRIPTOR], td[keys.SLOT_ACTIVE].unsqueeze(-1)
+    target, tip = td[keys.TARGET].unsqueeze(-2), td[keys.TIP].unsqueeze(-2)
+    return torch.where(active, obstacle_channels(descriptor, target, tip), 0.0)
+
+
+def obstacle_channels(descriptor: Tensor, target: Tensor, tip: Tensor) -> Tensor:
+    """Features of obstacle nodes from descriptors ``(..., 9)`` and targets and tips that broadcast to ``(..., 3)``."""
+    centre = descriptor[..., :3]
+    return torch.cat([descriptor, target - centre, tip - centre], dim=-1)
+
+
+def flat_observation(td: TensorDictBase) -> Tensor:
+    """What an MLP reads, per agent, ``(..., N, F)`` with F = ``flat_features(M)``: the same content as the graph.
+
+    In order: the agent's own 15 channels, the 15 channels of slot 0, 1, .., M - 1, the agent's own row of M sensed
+    edges as 0 or 1. The 7 reserved zeros of each node carry nothing and are left out.
+    """
+    own, slots = agent_channels(td), slot_channels(td)
+    shared = slots.flatten(-2).unsqueeze(-2).expand(*own.shape[:-1], -1)
+    return torch.cat([own, shared, td[keys.EDGE].to(own.dtype)], dim=-1)
+
+
+def flat_features(n_slots: int) -> int:
+    """Length of one agent's flat observation."""
+    return CHANNELS + n_slots * (CHANNELS + 1)
