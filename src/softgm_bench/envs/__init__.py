@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import torch
 
+from softgm_bench.envs.perturbation import PerturbationConfig
 from softgm_bench.envs.soft_arm import SoftArmEnv
 from softgm_bench.envs.tasks import TaskConfig, make_task
 from softgm_bench.rod.backend import make_backend
@@ -21,6 +22,7 @@ def make_env(
     dtype: torch.dtype = torch.float64,
     stagger: bool = False,
     curriculum: bool = False,
+    perturbation: PerturbationConfig | None = None,
 ) -> SoftArmEnv:
     """Build ``num_envs`` environments of one task; see ``SoftArmEnv`` for the arguments.
 
@@ -31,7 +33,7 @@ def make_env(
     rod = make_backend(backend or fused, rod_parameters)
     if not curriculum:
         task_config = replace(task_config, curriculum=replace(task_config.curriculum, enabled=False))
-    return SoftArmEnv(make_task(task_config), rod, num_envs, seed, horizon, device, dtype, stagger)
+    return SoftArmEnv(make_task(task_config), rod, num_envs, seed, horizon, device, dtype, stagger, perturbation)
 
 
-__all__ = ["SoftArmEnv", "make_env"]
+__all__ = ["PerturbationConfig", "SoftArmEnv", "make_env"]

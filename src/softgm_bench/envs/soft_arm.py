@@ -5,10 +5,12 @@ from collections.abc import Callable, Mapping
 import torch
 from tensordict import TensorClass, TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.data import Unbounded
 from torchrl.envs import EnvBase
 
 from softgm_bench.envs import keys
 from softgm_bench.envs.curriculum import Progress, difficulty, first_progress, note_ends
+from softgm_bench.envs.perturbation import Perturbation, PerturbationConfig
 from softgm_bench.envs.reward import reward_terms
 from softgm_bench.envs.sensing import Bins, Sight, SlotTable, bins_per_cylinder, cut_into_bins, empty_table, look
 from softgm_bench.envs.specs import DIRECTIONS, make_specs
@@ -71,6 +73,7 @@ class SoftArmEnv(EnvBase):
         device: torch.device | str = "cpu",
         dtype: torch.dtype = torch.float64,
         stagger: bool = False,
+        perturbation: PerturbationConfig | None = None,
     ) -> None:
         """Build the environments; the first ``reset`` draws their scenes.
 
@@ -84,6 +87,10 @@ class SoftArmEnv(EnvBase):
             dtype: of the rod's state; entries that policies read are float32.
             stagger: a full reset starts the episodes' clocks at random steps, so that their truncations do not fall
                 together and every batch of training holds all phases of an episode.
+            perturbation: of observations, sections and tip, none by default.
+
+        Raises:
+            ValueError: the perturbation is of a section that does not exist.
         """
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
         config, parameters = task.config, backend.parameters
@@ -116,16 +123,51 @@ class SoftArmEnv(EnvBase):
         self._generator.manual_seed(seed)
         curriculum = config.curriculum.enabled
         specs = make_specs(num_envs, self.n_agents, self.n_slots, self.n_privileged, curriculum, self.device)
+        self._perturbation: Perturbation | None = None
+        if perturbation is not None and not perturbation.nothing:
+            own = Perturbation(perturbation, num_envs, self.n_agents, seed, self.device, dtype)
+            self._perturbation, spec = own, specs["observation_spec"]
+            bounded = spec[keys.PREVIOUS_ACTION]
+            spec[keys.PREVIOUS_ACTION] = Unbounded(shape=bounded.shape, dtype=bounded.dtype, device=self.device)
+        self._tip_force: Tensor | None = None
         for name, spec in specs.items():
             setattr(self, name, spec)
         self._progress: Progress | None = first_progress(num_envs, self.device) if curriculum else None
         self._simulation, _ = self._fresh(num_envs)
+
+    # what simulates, as it is: for those who record or draw it; none of it is a copy
+
+    @property
+    def rod(self) -> RodState:
+        """The arms."""
+        return self._simulation.rod
+
+    @property
+    def scene(self) -> Scene:
+        """Targets and cylinders."""
+        return self._simulation.scene
+
+    @property
+    def applied_action(self) -> Tensor:
+        """What the sections did in the last step, ``(num_envs, n_agents, 2)`` float32; 0 after a reset."""
+        return self._simulation.previous_action
+
+    @property
+    def tip_force(self) -> Tensor | None:
+        """Force on the tip in the last step, N, ``(num_envs, 3)``; None if no perturbation pushes."""
+        return self._tip_force
+
+    def contacts(self) -> Tensor:
+        """Which nodes touch a cylinder, ``(num_envs, n_nodes)`` bool."""
+        return contact_nodes(self.rod.position, self._volume, self.scene.cylinders)
 
     # TorchRL's contract
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
             self._generator.manual_seed(seed)
+            if self._perturbation is not None:
+                self._perturbation.seed(seed)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDict:
         mask = None if tensordict is None else tensordict.get("_reset", None)
@@ -135,6 +177,8 @@ class SoftArmEnv(EnvBase):
                 self._simulation.steps.random_(0, self.horizon, generator=self._generator)
             if self._progress is not None:
                 self._progress.counting.fill_(not self.stagger)  # what is cut short says nothing about its scene
+            if self._perturbation is not None:
+                self._perturbation.begin()
         else:
             self._begin_again(mask.reshape(-1))
         return self._first_frame(self._simulation, self._look(self._simulation))
@@ -164,9 +208,15 @@ class SoftArmEnv(EnvBase):
         terminated, truncated = simulation.terminated, simulation.truncated
         action = tensordict.get(keys.ACTION).clamp(-1.0, 1.0)
         active = ~(terminated | truncated)
+        push = None
+        if self._perturbation is not None:
+            action = self._perturbation.applied(action)
+            self._tip_force = self._perturbation.tip_force(simulation.steps, active)
+            push = None if self._tip_force is None else self._on_tip(self._tip_force)
         moved = self.backend.control_step(
             rod,
             self._actuation.couple(action),
+            force=push,
             cylinders=scene.cylinders if self.task.max_cylinders else None,
             active=active,
         )
@@ -237,6 +287,8 @@ class SoftArmEnv(EnvBase):
         """
         if self._progress is not None:
             self._progress.counting.logical_or_(mask)
+        if self._perturbation is not None:
+            self._perturbation.begin(mask)
         if dense(self.device):
             fresh, sight = self._fresh(len(mask))
             self._simulation = fresh.where(mask, self._simulation)
@@ -252,6 +304,10 @@ class SoftArmEnv(EnvBase):
     def _agents(self, of_nodes: Tensor) -> Tensor:
         """``(num_envs, 3, n_nodes)`` to the agents' nodes, ``(num_envs, n_agents, 3)``."""
         return of_nodes.index_select(-1, self._agent_node).transpose(-1, -2)
+
+    def _on_tip(self, force: Tensor) -> Tensor:
+        """``(num_envs, 3)`` to a force on every node, ``(num_envs, 3, n_nodes)``."""
+        return torch.nn.functional.pad(force.unsqueeze(-1), (self.backend.parameters.n_elements, 0))
 
     def _look(self, simulation: Simulation) -> Sight:
         config = self.task.config
@@ -315,11 +371,16 @@ class SoftArmEnv(EnvBase):
         rod = simulation.rod
         terminated, truncated = simulation.terminated.unsqueeze(-1), simulation.truncated.unsqueeze(-1)
         position = rod.position
+        observed = (
+            _float32(self._agents(position)),
+            _float32(self._agents(rod.velocity)),
+            simulation.previous_action.clone(),
+        )
+        if self._perturbation is not None:
+            observed = self._perturbation.observed(*observed)
         entries: dict[str, dict[str, Tensor]] = {
             "agents": {
-                "position": _float32(self._agents(position)),
-                "velocity": _float32(self._agents(rod.velocity)),
-                "previous_action": simulation.previous_action.clone(),
+                **dict(zip(("position", "velocity", "previous_action"), observed, strict=True)),
                 "edge": sight.edge,
             },
             "slots": {"descriptor": sight.descriptor, "active": sight.active},
@@ -347,25 +408,34 @@ class SoftArmEnv(EnvBase):
     # what checkpoints need
 
     def generator_state(self) -> Tensor:
-        """State of the generator that scenes are drawn from."""
-        return self._generator.get_state()
+        """State of the generator that scenes are drawn from; with a perturbation, its own in a second row."""
+        states = [generator.get_state() for generator in self._generators()]
+        return states[0] if len(states) == 1 else torch.stack(states)
 
     def set_generator_state(self, state: Tensor) -> None:
         """Go on drawing from what ``generator_state`` returned."""
-        self._generator.set_state(state)
+        for generator, own in zip(self._generators(), state.reshape(-1, state.shape[-1]), strict=True):
+            generator.set_state(own.clone())  # a view's offset would not be heeded
+
+    def _generators(self) -> list[torch.Generator]:
+        return [self._generator, *([] if self._perturbation is None else [self._perturbation.generator])]
 
     def simulation_state(self) -> TensorDict:
-        """A copy of all episodes as they stand and, if there is one, of the curriculum."""
+        """A copy of all episodes as they stand and, if there are any, of the curriculum and the pushes' directions."""
         state = self._simulation.clone().to_tensordict()
         if self._progress is not None:
             state["curriculum"] = self._progress.clone().to_tensordict()
+        if self._perturbation is not None:
+            state["push"] = self._perturbation.direction.clone()
         return state
 
     def load_simulation_state(self, state: TensorDictBase) -> None:
         """Go on from what ``simulation_state`` returned for as many environments of the same task."""
-        self._simulation.update_(state.exclude("curriculum"))
+        self._simulation.update_(state.exclude("curriculum", "push"))
         if self._progress is not None:
             self._progress.update_(state["curriculum"])
+        if self._perturbation is not None:
+            self._perturbation.direction = state["push"].clone()
 
 
 def _put(new: TensorDictBase, into: TensorDictBase, merged: Callable[[Tensor, Tensor], Tensor]) -> None:
