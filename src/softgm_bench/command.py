@@ -1,5 +1,6 @@
 """What the commands beside training share: ``SOURCE key=value ...``, and one line for what a user can put right."""
 
+import difflib
 import os
 import sys
 from collections.abc import Callable
@@ -9,8 +10,9 @@ from typing import TypeVar, cast
 
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
-from softgm_bench.config import UserError
+from softgm_bench.config import CHANGEABLE, UserError
 from softgm_bench.experiment.explain import USER_ERRORS, explain
 
 Options = TypeVar("Options")
@@ -53,10 +55,10 @@ def parse(
         arguments: one path and settings.
         options: dataclass of the command's own settings, each with a default.
         source: what the path is, for the message when it is missing.
-        others: whether settings that are not the command's own are returned, for the configuration of a policy.
+        others: whether settings of a trained policy (``CHANGEABLE``) may be among them.
 
     Returns:
-        The path, the options, and the other settings as they were written.
+        The path, the options, and the policy's settings as they were written.
 
     Raises:
         UserError: no path or several, an unknown setting, or a value of the wrong type.
@@ -71,10 +73,16 @@ def parse(
     for argument in arguments:
         if argument not in paths:
             (own if argument.partition("=")[0] in names else rest).append(argument)
-    if rest and not others:
-        raise UserError(f"{rest[0].partition('=')[0]}: no such setting; choose from {', '.join(names)}")
+    for key in (setting.partition("=")[0] for setting in rest):
+        if not others or key.partition(".")[0] not in CHANGEABLE:
+            known = [*names, *(CHANGEABLE if others else ())]
+            close = difflib.get_close_matches(key.partition(".")[0], known, n=1)
+            advice = f"did you mean {close[0]}?" if close else f"choose from {', '.join(known)}"
+            raise UserError(f"{key}: no such setting; {advice}")
     try:
         merged = OmegaConf.merge(OmegaConf.structured(options), OmegaConf.from_dotlist(own))
+    except YAMLError as error:
+        raise UserError(f"{', '.join(own)}: a value that cannot be read") from error
     except OmegaConfBaseException as error:
         raise UserError(f"{error.full_key}: {str(error).splitlines()[0]}") from error
     return Path(paths[0]), cast(Options, OmegaConf.to_object(merged)), rest

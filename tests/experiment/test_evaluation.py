@@ -5,10 +5,12 @@ from counting_env import N_AGENTS, CountingEnv
 from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import exploration_type
 
-from softgm_bench.envs import keys
-from softgm_bench.experiment.evaluation import evaluate
+from softgm_bench.envs import keys, make_env
+from softgm_bench.experiment.evaluation import evaluate, evaluate_in_parts, evaluation_seed
+from softgm_bench.experiment.loop import derive_seeds
 from softgm_bench.experiment.summary import summarise, wilson_interval
 from softgm_bench.rod.dense import force_dense
+from softgm_bench.rod.parameters import RodParameters
 
 
 def policy(seen=None):
@@ -96,3 +98,60 @@ def test_wilson_interval_equals_published_values():
     assert wilson_interval(15, 148) == pytest.approx((0.0624, 0.1605), abs=5e-5)
     assert wilson_interval(0, 20) == pytest.approx((0.0, 0.1611), abs=5e-5)
     assert wilson_interval(1, 29) == pytest.approx((0.0061, 0.1718), abs=5e-5)
+
+
+def arm(settings, num_envs, seed):
+    return make_env(settings("task=wall").task, RodParameters(n_elements=20), num_envs, seed, horizon=40)
+
+
+def test_an_arms_episode_is_the_sum_of_what_its_steps_say(settings):
+    pushes = torch.tensor([[0.9, -0.2], [0.9, 0.4], [-0.9, 0.0]])[:, None].expand(3, 6, 2)
+    act = TensorDictModule(lambda tip: pushes, in_keys=[keys.TIP], out_keys=[keys.ACTION])
+    records = evaluate(act, arm(settings, 3, 0), deterministic=True, seed=5)
+    env = arm(settings, 3, 0)
+    env.set_seed(5)
+    frames = env.rollout(40, act, break_when_any_done=False)["next"]
+
+    assert records.length.tolist() == [40, 40, 40]
+    assert records.contact_steps.max() >= 3
+    assert records.discovered_bins.max() > 3
+    np.testing.assert_array_equal(records.contact_steps, (frames[keys.CONTACT_NODES] > 0).sum((1, 2)))
+    np.testing.assert_array_equal(records.discovered_bins, frames[keys.DISCOVERED][:, -1, 0])
+    np.testing.assert_array_equal(records.dropped_bins, frames[keys.DROPPED][:, -1, 0])
+    total = 0.0
+    for name in keys.REWARD_TERM_NAMES:
+        values = getattr(records, f"reward_{name}")
+        np.testing.assert_allclose(values, frames[keys.REWARD_TERMS, name].double().sum((1, 2)), rtol=1e-12)
+        total = total + values
+    np.testing.assert_allclose(records.undiscounted_return, total, rtol=1e-6)
+
+
+def test_parts_are_evaluations_with_seeds_of_their_own(settings):
+    built = []
+
+    def build(count, seed):
+        built.append((count, seed))
+        return arm(settings, count, seed)
+
+    act = TensorDictModule(lambda tip: torch.ones(len(tip), 6, 2), in_keys=[keys.TIP], out_keys=[keys.ACTION])
+    together = evaluate_in_parts(act, build, 5, deterministic=True, seed=3, at_once=2)
+    assert [count for count, _ in built] == [2, 2, 1]
+    assert len({seed for _, seed in built}) == 3
+    single = [evaluate(act, arm(settings, count, 0), deterministic=True, seed=seed) for count, seed in built]
+    np.testing.assert_array_equal(together.final_distance, np.concatenate([part.final_distance for part in single]))
+    assert together.contact_steps.shape == (5,)
+
+
+def test_what_a_task_does_not_tell_is_not_recorded(settings):
+    records = evaluate_in_parts(policy(), lambda count, seed: CountingEnv([2] * count), 3, deterministic=True, seed=0)
+    assert records.length.tolist() == [2, 2, 2]
+    assert records.reward_time is None
+    assert records.contact_steps is None
+    assert "reward_time" not in records.rows()[0]
+
+
+def test_evaluations_never_draw_what_training_draws():
+    numbers = range(100)
+    own = {evaluation_seed(seed, part) for seed in numbers for part in range(3)}
+    assert len(own) == 300
+    assert not own & {word for seed in numbers for word in derive_seeds(seed)}

@@ -82,3 +82,57 @@ def test_the_command_keeps_a_policy_or_says_what_is_wrong(run, tmp_path):
     failed = subprocess.run([*command, tmp_path / "nowhere", tmp_path / "x.pt"], capture_output=True, text=True)
     assert failed.returncode == 2
     assert len(failed.stderr.splitlines()) == 1
+
+
+def test_a_policy_acts_in_other_settings_with_the_same_parameters(run):
+    trained = policy.load(run)
+    changed = policy.load(run, overrides=["task.n_agents=4", "perturbation=noise", "task.horizon=7", "dtype=float32"])
+    assert (changed.config.task.n_agents, changed.config.perturbation.name) == (4, "noise")
+    assert (changed.config.task.horizon, changed.config.dtype) == (7, "float32")
+    assert changed.run == trained.run == trained.config
+    assert changed.label == trained.label == trained.run.algo.name
+    parameters = changed.policy.state_dict()
+    assert all(torch.equal(value, parameters[name]) for name, value in trained.policy.state_dict().items())
+    assert actions(changed).shape == (3, 3, 4, 2)
+
+
+def test_another_task_replaces_all_of_the_trainings_and_single_keys_come_after_it(run):
+    config = policy.load(run, overrides=["task.horizon=9", "task=wall_narrow", "perturbation=section_failure"]).config
+    assert (config.task.name, config.task.horizon, config.task.opening_side) == ("wall_narrow", 9, 0.24)
+    assert config.rod.n_elements == 20  # the run's
+    assert config.perturbation.failed_agents == (2,)
+
+
+def test_a_policy_with_settings_is_kept_as_it_was_trained(run, tmp_path):
+    policy.save(policy.load(run, overrides=["task.n_agents=3"]), tmp_path / "kept.pt")
+    assert policy.load(tmp_path / "kept.pt").config == policy.load(run).run
+
+
+def test_from_a_kept_file_too_a_policy_explores_as_at_the_end_of_training(run, tmp_path):
+    state = checkpoint.load(checkpoint.latest(run / "checkpoints"))
+    of_run = policy.load(run)
+    policy.save(of_run, tmp_path / "kept.pt")
+    kept = policy.load(tmp_path / "kept.pt")
+    fitted = policy.load(tmp_path / "kept.pt", overrides=["task.horizon=9"])
+    assert state["config"]["algo"]["name"] != "masac" or of_run.policy.uniform is False
+    for other in (kept, fitted):
+        assert getattr(other.policy, "uniform", None) is getattr(of_run.policy, "uniform", None)
+        assert getattr(other.policy, "sigma", None) == getattr(of_run.policy, "sigma", None)
+
+
+def test_an_mlp_is_told_which_slots_it_needs_and_softgm_needs_none(run):
+    if policy.load(run).label == "softgm":
+        assert actions(policy.load(run, overrides=["task=structured"])).shape == (3, 3, 6, 2)
+        return
+    with pytest.raises(UserError, match=r"128 obstacle slots, task=structured .* has 64: add task.slots=128$"):
+        policy.load(run, overrides=["task=structured"])
+    assert actions(policy.load(run, overrides=["task=structured", "task.slots=128"])).shape == (3, 3, 6, 2)
+
+
+def test_settings_that_training_has_settled_are_refused(run):
+    with pytest.raises(
+        UserError, match=r"^algo.gamma: not a setting of trained policies; those are task, rod, [^\n]*$"
+    ):
+        policy.load(run, overrides=["algo.gamma=0.5"])
+    with pytest.raises(UserError, match=r"^task: settings are written key=value$"):
+        policy.load(run, overrides=["task"])

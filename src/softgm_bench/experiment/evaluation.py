@@ -1,6 +1,7 @@
 """Vectorised evaluation: every environment counts exactly its first episode."""
 
 import itertools
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -8,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
@@ -15,18 +17,26 @@ from softgm_bench.envs import keys
 from softgm_bench.rod.dense import dense
 
 DISCOUNT = 0.99  # of the returns that are reported, whatever an algorithm trains with
-# Of an episode, by name in its records: what is summed over its steps, of that what is divided by their number, what
-# happened at any of them, and what was the case at the last one.
-SUMMED = {
+# Of an episode, by name in its records: what is summed over its steps, the discounted return first; of that what is
+# divided by their number; at how many steps something was above 0; what happened at any of them; and what was the case
+# at the last one.
+SUMMED: dict[str, NestedKey] = {
     "discounted_return": keys.REWARD,
     "undiscounted_return": keys.REWARD,
     "tip_travel_distance": keys.TIP_STEP,
     "torque_per_agent": keys.TORQUE_PER_AGENT,
     "torque_joint": keys.TORQUE_JOINT,
+    **{f"reward_{name}": (keys.REWARD_TERMS, name) for name in keys.REWARD_TERM_NAMES},
 }
 AVERAGED = frozenset({"torque_per_agent", "torque_joint"})
-HAPPENED = {"success": keys.SUCCESS, "diverged": keys.DIVERGED}
-LAST = {"final_distance": keys.DISTANCE}
+COUNTED: dict[str, NestedKey] = {"contact_steps": keys.CONTACT_NODES}
+HAPPENED: dict[str, NestedKey] = {"success": keys.SUCCESS, "diverged": keys.DIVERGED}
+LAST: dict[str, NestedKey] = {
+    "final_distance": keys.DISTANCE,
+    "discovered_bins": keys.DISCOVERED,
+    "dropped_bins": keys.DROPPED,
+}
+WHOLE = frozenset({"discovered_bins", "dropped_bins"})
 LOOK_EVERY = 16  # steps between two looks at whether an episode goes on, on a device that a look waits for
 
 
@@ -44,6 +54,10 @@ class EpisodeRecords:
         final_distance: tip to target at the end, m.
         torque_per_agent: mean over steps and agents of an agent's torque, N m.
         torque_joint: mean over steps of the norm over all agents and axes, N m.
+        contact_steps: control steps at whose end any node touched an obstacle.
+        discovered_bins: in the table of obstacles at the end.
+        dropped_bins: that the table had no slot for.
+        reward_distance: sum over steps of the reward's term of this name, as all that follow.
     """
 
     discounted_return: NDArray[np.float64]
@@ -55,6 +69,17 @@ class EpisodeRecords:
     final_distance: NDArray[np.float64] | None = None
     torque_per_agent: NDArray[np.float64] | None = None
     torque_joint: NDArray[np.float64] | None = None
+    contact_steps: NDArray[np.int64] | None = None
+    discovered_bins: NDArray[np.int64] | None = None
+    dropped_bins: NDArray[np.int64] | None = None
+    reward_distance: NDArray[np.float64] | None = None
+    reward_progress: NDArray[np.float64] | None = None
+    reward_smoothness: NDArray[np.float64] | None = None
+    reward_time: NDArray[np.float64] | None = None
+    reward_collision: NDArray[np.float64] | None = None
+    reward_discovery: NDArray[np.float64] | None = None
+    reward_stuck: NDArray[np.float64] | None = None
+    reward_success: NDArray[np.float64] | None = None
 
     def rows(self) -> list[dict[str, float | int]]:
         """One mapping per episode, of plain numbers."""
@@ -81,43 +106,115 @@ def evaluate(
         return _first_episodes(policy, env, gamma)
 
 
+def evaluate_in_parts(
+    policy: TensorDictModuleBase,
+    build: Callable[[int, int], EnvBase],
+    episodes: int,
+    *,
+    deterministic: bool,
+    seed: int,
+    gamma: float = DISCOUNT,
+    at_once: int | None = None,
+) -> EpisodeRecords:
+    """``episodes`` episodes; with the same ``at_once``, the same seed gives the same ones.
+
+    Args:
+        policy: to be evaluated.
+        build: makes an environment of so many environments with a seed.
+        episodes: how many.
+        deterministic: take the policy's mean instead of a sample.
+        seed: from which all seeds are derived; see ``evaluation_seed``.
+        gamma: of the discounted return.
+        at_once: environments simulated side by side, to save memory; None: all.
+    """
+    size = at_once or episodes
+    parts = []
+    for part, first in enumerate(range(0, episodes, size)):
+        own = evaluation_seed(seed, part)
+        env = build(min(size, episodes - first), own)
+        parts.append(asdict(evaluate(policy, env, deterministic=deterministic, seed=own, gamma=gamma)))
+    columns = {name: [part[name] for part in parts] for name, values in parts[0].items() if values is not None}
+    return EpisodeRecords(**{name: np.concatenate(values) for name, values in columns.items()})
+
+
+def evaluation_seed(seed: int, part: int = 0) -> int:
+    """Seed of the environments of an evaluation's part, independent of everything that any training draws."""
+    return int(np.random.SeedSequence(seed, spawn_key=(2, part)).generate_state(1)[0])
+
+
 def _first_episodes(policy: TensorDictModuleBase, env: EnvBase, gamma: float) -> EpisodeRecords:
     data = env.reset()
     alive = torch.ones(env.batch_size, dtype=torch.bool, device=env.device)
-    sums = {name: torch.zeros(env.batch_size, dtype=torch.float64, device=env.device) for name in SUMMED}
-    length = torch.zeros(env.batch_size, dtype=torch.int64, device=env.device)
-    happened = {name: torch.zeros_like(alive) for name in HAPPENED}
-    last = {name: torch.zeros_like(sums["discounted_return"]) for name in LAST}
-    told: set[NestedKey] = set()
-    discount, blind = 1.0, dense(alive.device)
+    tally: _Tally | None = None
+    blind = dense(alive.device)
     for step in itertools.count():
         if not (blind and step % LOOK_EVERY) and not alive.any():
             break
-        data = env.step(_act(policy, data, alive))
+        data = env.step(act(policy, data, alive))
         after = data["next"]
-        told = told or set(after.keys(include_nested=True))
-        for name in [name for name in SUMMED if SUMMED[name] in told]:
-            weight = discount if name == "discounted_return" else 1.0
-            sums[name] += torch.where(alive, weight * after[SUMMED[name]].squeeze(-1).double(), 0.0)
-        length += alive
-        for name in [name for name in HAPPENED if HAPPENED[name] in told]:
-            happened[name] |= alive & after[HAPPENED[name]].squeeze(-1)
-        for name in [name for name in LAST if LAST[name] in told]:
-            last[name] = torch.where(alive, after[LAST[name]].squeeze(-1).double(), last[name])
+        tally = tally or _Tally(after, gamma)
+        tally.add(after, alive)
         alive = alive & ~after[keys.DONE].squeeze(-1)
-        discount *= gamma
         data = step_mdp(data)
-    for name in AVERAGED:
-        sums[name] /= length
-    results = {
-        name: value.cpu().numpy()
-        for name, value in (sums | happened | last).items()
-        if (SUMMED | HAPPENED | LAST)[name] in told
-    }
-    return EpisodeRecords(length=length.cpu().numpy(), **results)
+    assert tally is not None
+    return tally.records()
 
 
-def _act(policy: TensorDictModuleBase, data: TensorDictBase, alive: torch.Tensor) -> TensorDictBase:
+class _Tally:
+    """Adds up what episodes say of themselves."""
+
+    def __init__(self, frame: TensorDictBase, gamma: float) -> None:
+        """Begin with nothing; ``frame``, ``(episodes,)``, shows what there is to add up."""
+        told = set(frame.keys(include_nested=True))
+        kinds = (SUMMED, COUNTED, HAPPENED, LAST)
+        self._summed, self._counted, self._happened, self._last = (
+            {name: key for name, key in kind.items() if key in told} for kind in kinds
+        )
+        (episodes,), device = frame.batch_size, frame.device
+        self._sums = torch.zeros((episodes, len(self._summed)), dtype=torch.float64, device=device)
+        self._weight = torch.ones(len(self._summed), dtype=torch.float64, device=device)
+        self._gamma = gamma
+        self._counts = torch.zeros((episodes, 1 + len(self._counted)), dtype=torch.int64, device=device)
+        self._ever = torch.zeros((episodes, len(self._happened)), dtype=torch.bool, device=device)
+        self._ends = torch.zeros((episodes, len(self._last)), dtype=torch.float64, device=device)
+
+    def add(self, frame: TensorDictBase, alive: Tensor) -> None:
+        """Add a step of the episodes in ``alive``, ``(episodes,)``."""
+        going = alive.unsqueeze(-1)
+        self._sums += torch.where(going, _columns(frame, self._summed).double() * self._weight, 0.0)
+        self._weight[0] *= self._gamma
+        self._counts[:, :1] += going
+        if self._counted:
+            self._counts[:, 1:] += going & (_columns(frame, self._counted) > 0)
+        if self._happened:
+            self._ever |= going & _columns(frame, self._happened)
+        if self._last:
+            self._ends = torch.where(going, _columns(frame, self._last).double(), self._ends)
+
+    def records(self) -> EpisodeRecords:
+        """All that has been added."""
+        length = self._counts[:, 0]
+        columns = {
+            **_split(self._summed, self._sums),
+            **_split(("length", *self._counted), self._counts),
+            **_split(self._happened, self._ever),
+            **_split(self._last, self._ends),
+        }
+        columns |= {name: columns[name] / length for name in AVERAGED & columns.keys()}
+        columns |= {name: columns[name].long() for name in WHOLE & columns.keys()}
+        return EpisodeRecords(**{name: values.cpu().numpy() for name, values in columns.items()})
+
+
+def _columns(frame: TensorDictBase, entries: Mapping[str, NestedKey]) -> Tensor:
+    """Entries ``(episodes, 1)`` side by side."""
+    return torch.cat([frame.get(key) for key in entries.values()], dim=-1)
+
+
+def _split(names: Iterable[str], columns: Tensor) -> dict[str, Tensor]:
+    return dict(zip(names, columns.unbind(-1), strict=True))
+
+
+def act(policy: TensorDictModuleBase, data: TensorDictBase, alive: Tensor) -> TensorDictBase:
     """Actions of the environments whose first episode goes on; zeros, unpaid for, in the others.
 
     On a device that a look at ``alive`` waits for, all are paid for.

@@ -15,6 +15,8 @@ USER_ERRORS = (UserError, HydraException, OmegaConfBaseException, OSError)
 
 def explain(error: Exception, overrides: list[str]) -> str:
     """One line for an error of a type in ``USER_ERRORS``; ``overrides`` is the command line that led to it."""
+    if isinstance(error, UserError):
+        return _first_line(error)  # whatever is behind it
     if isinstance(error, MissingConfigException) and error.options is not None:
         group, _, name = str(error.missing_cfg_file).rpartition("/")
         return f"{group}={name}: no such {group}; choose one of {', '.join(sorted(error.options))}"
@@ -56,7 +58,7 @@ def _nearest(key: str, overrides: list[str]) -> str:
 def _valid_keys(overrides: list[str]) -> Iterator[str]:
     """Every key of the configuration that the chosen groups make up, dotted."""
     choices = [
-        override for override in overrides if re.fullmatch(r"(task|algo|model|recipe|experiment|rod)=\w+", override)
+        override for override in overrides if re.fullmatch(r"(task|algo|model|recipe|experiment|rod|perturbation|logger)=\w+", override)
     ]
     try:
         config = compose_untyped(choices)

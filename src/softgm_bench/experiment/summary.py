@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from softgm_bench.envs import keys
 from softgm_bench.experiment.evaluation import EpisodeRecords
 
-# Name in the summary, field of the records.
+# Name in the summary, field of the records; a reader's table leaves out what the reward is made of.
 AVERAGED = {
     "discounted_return": "discounted_return",
     "undiscounted_return": "undiscounted_return",
@@ -19,6 +20,10 @@ AVERAGED = {
     "final_distance": "final_distance",
     "torque_per_agent": "torque_per_agent",
     "torque_joint": "torque_joint",
+    "contact_steps": "contact_steps",
+    "discovered_bins": "discovered_bins",
+    "dropped_bins": "dropped_bins",
+    **{f"reward_{name}": f"reward_{name}" for name in keys.REWARD_TERM_NAMES},
 }
 
 
@@ -65,7 +70,7 @@ def table(metrics: Mapping[str, Any], title: str) -> str:
     rows += [
         (name.replace("_", " "), f"{metrics[name]['mean']:.3f} +- {metrics[name]['std']:.3f}")
         for name in AVERAGED
-        if name in metrics
+        if name in metrics and not name.startswith("reward_")
     ]
     rows += [(name, str(metrics[name])) for name in ("diverged", "episodes") if name in metrics]
     width = max(len(name) for name, _ in rows)

@@ -1,0 +1,124 @@
+"""Evaluate a trained policy: ``python -m softgm_bench.evaluate SOURCE key=value ...``.
+
+SOURCE is a run folder (its newest checkpoint), a checkpoint or a policy's file. Settings, with their defaults:
+
+  episodes=100         of which each environment plays one
+  seed=0               of targets, obstacles and perturbations; never training's
+  deterministic=true   false: actions are sampled, as in training
+  horizon=null         control steps of an episode; null: the task's own
+  gamma=0.99           of the discounted return
+  batch=null           environments at once, to save memory; null: all. Other batches play other episodes
+  threads=null         null: every core that this process may use
+  device=cpu           cpu, cuda or cuda:<index>
+  out=null             folder for episodes.csv and summary.json; null: SOURCE/evaluations/... of a run folder,
+                       outputs/evaluations/... of a file
+  overwrite=false      true: replace the evaluation that out holds
+
+Any other setting changes what the policy acts in:
+
+  task=wall                      any task of conf/task, also one that it was not trained on
+  task.n_agents=8                any single setting of the task; rod.<key>, backend and dtype likewise
+  perturbation=noise             none, noise, section_failure or disturbance (conf/perturbation)
+  perturbation.tip_force=30      any single setting of it
+"""
+
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from softgm_bench import command
+from softgm_bench.config import UserError, available_threads
+
+
+@dataclass
+class Options:
+    """The command's own settings; meanings above."""
+
+    episodes: int = 100
+    seed: int = 0
+    deterministic: bool = True
+    horizon: int | None = None
+    gamma: float = 0.99
+    batch: int | None = None
+    threads: int | None = None
+    device: str = "cpu"
+    out: str | None = None
+    overwrite: bool = False
+
+    def check(self) -> None:
+        """Refuse values that make no sense.
+
+        Raises:
+            UserError: naming the first such setting, its value and what would be right.
+        """
+        for key in ("episodes", "horizon", "batch"):
+            value = getattr(self, key)
+            if value is not None and value < 1:
+                raise UserError(f"{key}={value}: it must be at least 1")
+        if not 0 <= self.seed < 2**63:
+            raise UserError(f"seed={self.seed}: a seed is a whole number from 0 to 2**63 - 1")
+        if not 0.0 <= self.gamma <= 1.0:
+            raise UserError(f"gamma={self.gamma}: it must lie between 0 and 1")
+        if self.threads is not None and not 1 <= self.threads <= available_threads():
+            raise UserError(f"threads={self.threads}: choose 1 to {available_threads()}, the cores here, or null")
+        if self.out == "":
+            raise UserError("out is empty: name a folder for the evaluation")
+
+
+def main() -> int:
+    """Run what the command line says; 0, or 2 after one line about what is wrong."""
+    return command.run("evaluate", __doc__, _evaluate)
+
+
+def _evaluate(arguments: list[str]) -> None:
+    source, options, overrides = command.parse(
+        arguments, Options, "run folder, checkpoint or policy's file", others=True
+    )
+    options.check()
+    # late: a refused command need not wait for torch
+    from softgm_bench.experiment import evaluation_folder, policy
+    from softgm_bench.experiment.environment import build_env
+    from softgm_bench.experiment.evaluation import evaluate_in_parts
+    from softgm_bench.experiment.loop import keep_memory, set_threads
+    from softgm_bench.experiment.summary import table
+
+    trained = policy.load(source, options.device, overrides)
+    unusual = {"horizon": options.horizon, "sampled": not options.deterministic}
+    folder = Path(options.out or evaluation_folder.default_folder(source, trained, overrides, options.seed, unusual))
+    evaluation_folder.check(folder, options.overwrite)
+    threads = set_threads(options.threads)
+    keep_memory()
+    began = time.perf_counter()
+    records = evaluate_in_parts(
+        trained.policy,
+        lambda count, seed: build_env(trained.config, count, seed, options.horizon),
+        options.episodes,
+        deterministic=options.deterministic,
+        seed=options.seed,
+        gamma=options.gamma,
+        at_once=options.batch,
+    )
+    seconds = time.perf_counter() - began
+    settings = {
+        "evaluation_seed": options.seed,
+        "deterministic": options.deterministic,
+        "horizon": options.horizon or trained.config.task.horizon,
+        "batch": options.batch,
+        "discount": options.gamma,
+        "threads": threads,
+        "overrides": overrides,
+    }
+    summary = evaluation_folder.describe(trained, records, settings)
+    under = trained.config.perturbation.name
+    title = f"{trained.label} on {summary['task']}, perturbation {under}, seed {options.seed}:"
+    print(table(summary["metrics"], title), flush=True)  # before anything is written: a full disk leaves it
+    try:
+        evaluation_folder.write(folder, records, summary)
+    except OSError as error:
+        raise UserError(f"out={folder}: {error.strerror}; the table above is all that there is") from error
+    print(f"{seconds:.1f} s; written to {folder}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
