@@ -1,0 +1,167 @@
+"""Draw one episode: ``python -m softgm_bench.render SOURCE out=FILE[,FILE...] [key=value ...]``.
+
+SOURCE is a run folder, a checkpoint or a policy's file, of which an episode is recorded, or a recorded episode (.npz).
+The end of each FILE's name says what it is: .png a still, .mp4, .webp or .gif a video, .html an interactive page.
+
+  seed=0 episode=0       which episode of a policy is recorded
+  horizon=  deterministic=true
+  save=FILE.npz          keep the recorded episode
+  step=                  moment of a still, in control steps; the last one by default
+  fps=25 speed=          of a video; by default the slowest power of two at which it lasts at most 10 s
+  width=960 height=720   pixels
+  azimuth= elevation=    degrees: where the camera is, from +x towards +y and above the horizon
+  distance=              m: how far away the camera is; by default so that the whole episode fits
+  attention=false        draw attention as edges from discovered bins to agents, as opaque as it is strong
+  text=                  write time and distance; by default in videos only
+  threads=               for a video, by default all that there are
+
+Other settings change what the policy was trained with, e.g. task=wall_narrow or task.n_agents=8.
+"""
+
+import importlib.util
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from softgm_bench import command
+from softgm_bench.config import UserError
+
+if TYPE_CHECKING:
+    from softgm_bench.experiment.trajectory import Trajectory
+
+KINDS = (".png", ".mp4", ".webp", ".gif", ".html")
+LARGEST = 4096  # pixels
+RECORDING = ("seed", "episode", "horizon", "deterministic")
+
+
+@dataclass
+class Options:
+    """The command's settings; None: what the text above says."""
+
+    out: str = ""
+    seed: int | None = None
+    episode: int | None = None
+    horizon: int | None = None
+    deterministic: bool | None = None
+    save: str | None = None
+    step: float | None = None
+    fps: int = 25
+    speed: float | None = None
+    width: int = 960
+    height: int = 720
+    azimuth: float | None = None
+    elevation: float | None = None
+    distance: float | None = None
+    attention: bool = False
+    text: bool | None = None
+    threads: int | None = None
+
+
+def main(arguments: list[str]) -> None:
+    """Record or load an episode and write every file.
+
+    Raises:
+        UserError: an argument that makes no sense, or a file that cannot be read or written.
+    """
+    source, options, overrides = command.parse(
+        arguments, Options, "policy, checkpoint, run folder or recorded episode", others=True
+    )
+    files = _files(options)
+    _check(options, files)
+    from softgm_bench.experiment import trajectory as episodes  # late: what is refused should not wait
+
+    if source.suffix == ".npz":
+        given = [name for name in RECORDING if getattr(options, name) is not None]
+        if given:
+            raise UserError(f"{given[0]}: {source} is recorded already; name a policy to record another episode")
+    page = any(file.suffix == ".html" for file in files)
+    chosen = {name: getattr(options, name) for name in RECORDING if getattr(options, name) is not None}
+    trajectory = episodes.record_or_load(source, attention=options.attention or page, overrides=overrides, **chosen)
+    _check_against(trajectory, options)
+    if options.save:
+        episodes.save(trajectory, Path(options.save))
+    for file in files:
+        _write(trajectory, options, file)
+        print(f"{episodes.describe(trajectory.info)}: {file}")
+
+
+def _files(options: Options) -> list[Path]:
+    files = [Path(name) for name in options.out.split(",") if name]
+    if not files:
+        raise UserError(f"out: name a file that ends in {', '.join(KINDS)}")
+    for file in files:
+        if file.suffix not in KINDS:
+            raise UserError(f"{file}: its name must end in one of {', '.join(KINDS)}")
+    return files
+
+
+def _check(options: Options, files: list[Path]) -> None:
+    kinds = {file.suffix for file in files}
+    for name, low, high in (("width", 16, LARGEST), ("height", 16, LARGEST), ("fps", 1, 120)):
+        if not low <= getattr(options, name) <= high:
+            raise UserError(f"{name} is {getattr(options, name)}: it must be from {low} to {high}")
+        if name != "fps" and ".mp4" in kinds and getattr(options, name) % 2:
+            raise UserError(f"{name} is {getattr(options, name)}: an MP4 video needs an even number")
+    for name in ("speed", "distance", "threads"):
+        value = getattr(options, name)
+        if value is not None and not 0.0 < value < float("inf"):
+            raise UserError(f"{name} is {value}: it must be above 0")
+    if options.step is not None and not 0.0 <= options.step < float("inf"):
+        raise UserError(f"step is {options.step:g}: it must be a control step from 0")
+    if options.elevation is not None and not -89.0 <= options.elevation <= 89.0:
+        raise UserError(f"elevation is {options.elevation}: it must be from -89 to 89")
+    if options.azimuth is not None and not abs(options.azimuth) <= 360.0:
+        raise UserError(f"azimuth is {options.azimuth}: it must be from -360 to 360")
+    if options.save is not None and Path(options.save).suffix != ".npz":
+        raise UserError(f"{options.save}: a trajectory's file ends in .npz")
+    needed = {"PIL": kinds - {".html"}, "av": kinds & {".mp4"}}
+    for module, of in needed.items():
+        if of and importlib.util.find_spec(module) is None:
+            raise UserError(f"{min(of)}: {module} is not installed; pip install 'softgm-bench[render]'")
+
+
+def _check_against(trajectory: "Trajectory", options: Options) -> None:
+    if options.step is not None and options.step > trajectory.steps:
+        raise UserError(f"step is {options.step:g}: this episode has steps 0 to {trajectory.steps}")
+    if options.attention and not trajectory.attention:
+        raise UserError("attention: this episode has none; its policy has no attention, or it was recorded without")
+
+
+def _write(trajectory: "Trajectory", options: Options, file: Path) -> None:
+    if file.suffix == ".html":
+        from softgm_bench.render.html import default_camera, write_html
+
+        chosen = {name: getattr(options, name) for name in ("azimuth", "elevation")}
+        camera = default_camera(trajectory) | {name: value for name, value in chosen.items() if value is not None}
+        write_html(trajectory, file, camera=camera)
+        return
+    from softgm_bench.experiment.run_folder import write_atomically
+
+    content = _draw(trajectory, options, file.suffix)
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(file, content)
+    except OSError as error:
+        raise UserError(f"{file}: {error.strerror}; choose a file that can be written") from error
+
+
+def _draw(trajectory: "Trajectory", options: Options, kind: str) -> bytes:
+    from softgm_bench.render import video
+    from softgm_bench.render.still import Look, Studio, png
+
+    text = kind != ".png" if options.text is None else options.text
+    names = ("width", "height", "azimuth", "elevation", "distance", "attention")
+    settings: dict[str, Any] = {name: getattr(options, name) for name in names}
+    studio = Studio(trajectory, Look(text=text, **settings))
+    if kind == ".png":
+        return png(studio.picture(float(trajectory.steps) if options.step is None else options.step))
+    control_dt = studio.stage.control_dt
+    speed = options.speed or video.natural_speed(trajectory.steps * control_dt)
+    times = video.moments(trajectory.steps, control_dt, options.fps, speed)
+    frames = video.pictures(studio, times, speed, options.threads)
+    return video.mp4(frames, options.fps) if kind == ".mp4" else video.animated(frames, options.fps, kind[1:])
+
+
+if __name__ == "__main__":
+    sys.exit(command.run("render", __doc__, main))

@@ -1,0 +1,187 @@
+"""From round cones to an image: one ray a pixel, more where neighbouring pixels differ; compiled functions."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softgm_bench.render.camera import NEAR, Camera
+from softgm_bench.render.geometry import MISS, hit_round_cone, jit
+from softgm_bench.render.grid import Grid, cell_of, make_grid
+from softgm_bench.render.shading import MARK, Drawing, lit_part, open_part, shade, texture_at
+
+TILE = 8.0  # pixels
+LAYERS = 24  # translucent surfaces in front of one another; more are left out
+BACKDROP = (0.905, 0.88, 0.84)  # linear
+HIDDEN = 0.6  # part of its opacity that a mark keeps behind what hides it
+CONTRAST = 0.02  # difference of neighbouring pixels, square root of linear, from which both are looked at again
+# Places of the further rays in a pixel: no two in one row or column.
+ROOKS = np.array([[0, 2], [1, 4], [2, 0], [3, 5], [4, 1], [5, 3]]) / 6.0 + 1.0 / 12.0
+
+
+class View(NamedTuple):
+    """The camera as compiled functions read it."""
+
+    position: NDArray[np.float64]
+    basis: NDArray[np.float64]
+    focal: float
+    width: int
+    height: int
+    tiles: Grid
+
+
+def render(drawing: Drawing, camera: Camera) -> NDArray[np.uint8]:
+    """Draw.
+
+    Args:
+        drawing: everything.
+        camera: outside of all round cones.
+
+    Returns:
+        sRGB image, ``(height, width, 3)``. The same arguments give the same image.
+    """
+    low, high = _on_screen(drawing.cone, camera)
+    tiles = make_grid(low, high, TILE, ([0.0, 0.0, 0.0], [camera.width - 1.0, camera.height - 1.0, 0.0]))
+    view = View(camera.position, camera.basis, camera.focal, camera.width, camera.height, tiles)
+    return _to_srgb(_draw(drawing, view, ROOKS))
+
+
+def _on_screen(cone: NDArray[np.float64], camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Boxes in pixels, ``(P, 3)`` each, of the third coordinate 0, around the round cones' pictures.
+
+    The hull of two spheres is inside of the hull of two boxes around them, whose corners are looked at.
+    """
+    corner = np.stack(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [-1.0, 1.0], indexing="ij"), axis=-1).reshape(8, 3)
+    offset = corner @ camera.basis  # boxes along the camera's axes
+    ends = cone.reshape(-1, 2, 4)
+    points = ends[:, :, None, :3] + ends[:, :, None, 3:] * offset
+    pixel, depth = camera.project(points.reshape(len(cone), 16, 3))
+    low, high = np.zeros((len(cone), 3)), np.zeros((len(cone), 3))
+    low[:, :2], high[:, :2] = pixel.min(axis=1) - 1.0, pixel.max(axis=1) + 1.0
+    behind = (depth <= NEAR).any(axis=1)  # its picture is not bounded by its corners'
+    low[behind, :2], high[behind, :2] = 0.0, [camera.width, camera.height]
+    return low, high
+
+
+def _to_srgb(image: NDArray[np.float64]) -> NDArray[np.uint8]:
+    return _SRGB[(np.clip(image, 0.0, 1.0) * (len(_SRGB) - 1) + 0.5).astype(np.uint16)]
+
+
+def _encoded(levels: int) -> NDArray[np.uint8]:
+    """sRGB values of linear ones from 0 to 1."""
+    value = np.linspace(0.0, 1.0, levels)
+    encoded = np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1.0 / 2.4) - 0.055)
+    return (255.0 * encoded + 0.5).astype(np.uint8)
+
+
+_SRGB = _encoded(1 << 14)
+
+
+@jit
+def _draw(drawing, view, rooks):
+    """Linear image ``(height, width, 3)``: a ray through every pixel's middle, then more where there is an edge."""
+    width, height = view.width, view.height
+    image = np.empty((height, width, 3))
+    depth = np.empty(LAYERS)
+    layer = np.empty(LAYERS, np.int64)
+    place = np.empty(LAYERS)
+    edge = np.ones((height, width), np.bool_)
+    for sweep in range(2):
+        rays = 1 if sweep == 0 else len(rooks)
+        for j in range(height):
+            for i in range(width):
+                if not edge[j, i]:
+                    continue
+                red, green, blue = 0.0, 0.0, 0.0
+                for k in range(rays):
+                    x, y = (0.5, 0.5) if sweep == 0 else (rooks[k, 0], rooks[k, 1])
+                    r, g, b = _look(drawing, view, i + x, j + y, depth, layer, place)
+                    red, green, blue = red + min(r, 1.0), green + min(g, 1.0), blue + min(b, 1.0)
+                image[j, i, 0], image[j, i, 1], image[j, i, 2] = red / rays, green / rays, blue / rays
+        if sweep == 0:
+            edge = _edges(image)
+    return image
+
+
+@jit
+def _edges(image):
+    """Pixels that differ from a neighbour, ``(height, width)`` bool."""
+    height, width = image.shape[0], image.shape[1]
+    edge = np.zeros((height, width), np.bool_)
+    for j in range(height):
+        for i in range(width):
+            for di, dj in ((1, 0), (0, 1)):
+                if i + di < width and j + dj < height:
+                    for c in range(3):
+                        one, two = np.sqrt(max(image[j, i, c], 0.0)), np.sqrt(max(image[j + dj, i + di, c], 0.0))
+                        if abs(one - two) > CONTRAST:
+                            edge[j, i] = True
+                            edge[j + dj, i + di] = True
+    return edge
+
+
+@jit
+def _look(drawing, view, x, y, depth, layer, place):
+    """Linear colour at pixel coordinates (x, y); depth, layer and place are room for translucent surfaces."""
+    across = (x - 0.5 * view.width) / view.focal
+    upward = (0.5 * view.height - y) / view.focal
+    basis = view.basis
+    dx = across * basis[0, 0] + upward * basis[1, 0] + basis[2, 0]
+    dy = across * basis[0, 1] + upward * basis[1, 1] + basis[2, 1]
+    dz = across * basis[0, 2] + upward * basis[1, 2] + basis[2, 2]
+    scale = 1.0 / np.sqrt(dx * dx + dy * dy + dz * dz)
+    dx, dy, dz = dx * scale, dy * scale, dz * scale
+    ox, oy, oz = view.position[0], view.position[1], view.position[2]
+
+    nearest, solid, solid_place, count = MISS, -1, 0.0, 0
+    cell = cell_of(view.tiles, x, y, 0.0)
+    for k in range(view.tiles.first[cell], view.tiles.first[cell + 1]):
+        n = view.tiles.items[k]
+        t, along = hit_round_cone(ox, oy, oz, dx, dy, dz, drawing.cone, n)
+        if t >= nearest and drawing.owner[n] != MARK:
+            continue
+        if drawing.owner[n] != MARK and texture_at(drawing, n, along)[3] >= 0.995:
+            nearest, solid, solid_place = t, n, along
+        elif t < MISS and count < LAYERS:
+            m = count
+            while m > 0 and depth[m - 1] < t:  # furthest first
+                depth[m], layer[m], place[m] = depth[m - 1], layer[m - 1], place[m - 1]
+                m -= 1
+            depth[m], layer[m], place[m] = t, n, along
+            count += 1
+
+    down = (drawing.floor - oz) / dz if dz < 0.0 and oz > drawing.floor else MISS
+    red, green, blue = _backdrop(x / view.width, y / view.height)
+    if solid >= 0 and nearest < down:
+        red, green, blue, _ = shade(
+            drawing, solid, solid_place, ox + nearest * dx, oy + nearest * dy, oz + nearest * dz, dx, dy, dz
+        )
+    else:
+        nearest = down
+        if down < MISS:
+            taken = _floor(drawing, ox + down * dx, oy + down * dy)
+            red, green, blue = red * (1.0 - 0.92 * taken), green * (1.0 - taken), blue * (1.0 - taken)
+    for m in range(count):
+        t = depth[m]
+        if t < nearest or drawing.owner[layer[m]] == MARK:
+            r, g, b, opacity = shade(drawing, layer[m], place[m], ox + t * dx, oy + t * dy, oz + t * dz, dx, dy, dz)
+            if t >= nearest:
+                opacity *= HIDDEN
+            red, green, blue = red + opacity * (r - red), green + opacity * (g - green), blue + opacity * (b - blue)
+    return red, green, blue
+
+
+@jit
+def _backdrop(x, y):
+    """Linear colour of the studio behind everything, darker towards the corners; x and y from 0 to 1."""
+    corner = (x - 0.5) ** 2 + (y - 0.5) ** 2
+    light = 1.04 - 0.30 * corner
+    return BACKDROP[0] * light, BACKDROP[1] * light, BACKDROP[2] * light
+
+
+@jit
+def _floor(drawing, px, py):
+    """How much of the floor's light is taken by shadows, 0 to 1; there is nothing else to see of the floor."""
+    lit = lit_part(drawing, px, py, drawing.floor)
+    around = open_part(drawing, px, py, drawing.floor, 0.0, 0.0, 1.0)
+    return 1.0 - (0.62 + 0.38 * lit) * (0.45 + 0.55 * around)
