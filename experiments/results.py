@@ -4,10 +4,11 @@ Reads ``experiments/trained/<task>/<algorithm>/seed<seed>/`` and rewrites ``docs
 ``docs/results.md``, each between a line ``<!-- task -->`` and ``<!-- end -->``.
 """
 
-import json
 import re
+from functools import cache
 from pathlib import Path
-from typing import Any
+
+from softgm_bench.analysis.runs import Run, find
 
 ROOT = Path(__file__).parents[1]
 RUNS = ROOT / "experiments" / "trained"
@@ -20,10 +21,27 @@ HEADER = (
 )
 
 
-def runs(task: str) -> list[tuple[Path, dict[str, Any]]]:
-    """Folders and summaries of a task's runs, the most successful first."""
-    found = [(path.parent, json.loads(path.read_text())) for path in RUNS.glob(f"{task}/*/*/summary.json")]
-    return sorted(found, key=lambda run: (-run[1]["final_evaluation"]["success_rate"]["mean"], str(run[0])))
+@cache
+def all_runs() -> list[Run]:
+    """Of every task.
+
+    Raises:
+        SystemExit: a folder that holds no whole run.
+    """
+    found = find(RUNS)
+    if found.problems:
+        raise SystemExit(f"{found.problems[0].folder}: {found.problems[0].reason}")
+    return found.runs
+
+
+def runs(task: str) -> list[Run]:
+    """A task's runs, the most successful first."""
+    of_task = [run for run in all_runs() if run.final.task == task]
+    return sorted(of_task, key=lambda run: (-_success(run)["mean"], run.final.folder))
+
+
+def _success(run: Run) -> dict[str, float]:
+    return run.summary["final_evaluation"]["success_rate"]
 
 
 def table(task: str) -> str:
@@ -31,9 +49,9 @@ def table(task: str) -> str:
     if not runs(task):
         return "No run yet."
     rows = [HEADER, "|" + " --- |" * HEADER.count(" |")]
-    for _, summary in runs(task):
+    for run in runs(task):
+        summary, success = run.summary, _success(run)
         result = summary["final_evaluation"]
-        success = result["success_rate"]
         cells = [
             summary["algo"],
             str(summary["seed"]),
@@ -71,20 +89,18 @@ def draw() -> None:
     tasks = [task for task in TASKS if runs(task)]
     size = (3.8 * len(tasks), 3.4)
     figure, panels = plt.subplots(1, len(tasks), figsize=size, sharey=True, squeeze=False, layout="constrained")
-    names = sorted({summary["algo"] for task in tasks for _, summary in runs(task)})
+    names = sorted({run.final.label for task in tasks for run in runs(task)})
     for axes, task in zip(panels[0], tasks, strict=True):
-        for folder, summary in runs(task):
-            lines = [json.loads(line) for line in (folder / "evaluations.jsonl").read_text().splitlines()]
-            colour = f"C{names.index(summary['algo'])}"
-            success = summary["final_evaluation"]["success_rate"]
+        for run in runs(task):
+            success, colour = _success(run), f"C{names.index(run.final.label)}"
             axes.plot(
-                [line["frames"] / 1e6 for line in lines],
-                [line["success_rate"]["mean"] for line in lines],
+                [line["frames"] / 1e6 for line in run.progress],
+                [line["success_rate"]["mean"] for line in run.progress],
                 color=colour,
-                label=summary["algo"],
+                label=run.final.label,
             )
             interval = [[success["mean"] - success["low"]], [success["high"] - success["mean"]]]
-            axes.errorbar([summary["frames"] / 1e6], [success["mean"]], interval, fmt="o", ms=3, color=colour)
+            axes.errorbar([run.final.frames / 1e6], [success["mean"]], interval, fmt="o", ms=3, color=colour)
         axes.set(title=task, xlabel="million frames", ylim=(-0.02, 1.02))
         axes.legend(frameon=False, fontsize=7)
         axes.spines[["top", "right"]].set_visible(False)

@@ -31,9 +31,7 @@ def test_a_kept_policy_belongs_to_a_committed_run(path, results):
     trained = policy.load(path)
     task = trained.config.task.name
     assert path.stem == f"{task}_{trained.config.label}"
-    assert trained.frames in [
-        summary["frames"] for _, summary in results.runs(task) if summary["algo"] == trained.config.label
-    ]
+    assert trained.frames in [run.final.frames for run in results.runs(task) if run.final.label == trained.config.label]
 
 
 @pytest.mark.parametrize("algo", ["softgm", "mappo"])

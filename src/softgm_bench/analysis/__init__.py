@@ -1,0 +1,1 @@
+"""What is read from runs: statistics, tables, figures, attention."""
