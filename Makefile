@@ -3,7 +3,7 @@ PYTHON ?= python3.11
 BIN := .venv/bin
 STAMP := .venv/.setup
 
-.PHONY: setup train test test-slow check bench bench-gpu parity validation peers peers-setup
+.PHONY: setup train test test-slow check bench bench-gpu parity validation peers peers-setup report pictures
 
 setup: $(STAMP)
 
@@ -47,6 +47,14 @@ parity: setup
 
 validation: setup
 	$(BIN)/python benchmarks/validation.py
+
+# The example report, from the committed runs and evaluations.
+report: setup
+	$(BIN)/python -m softgm_bench.report experiments/trained evaluations=experiments/robustness out=experiments/report
+
+# The pictures of docs/pictures, from the policies in experiments/policies.
+pictures: setup
+	$(BIN)/python experiments/pictures.py
 
 # Our algorithms and BenchMARL's on two VMAS tasks. BenchMARL needs an older TorchRL, so it has a virtual environment of
 # its own. Runs of which the results are there already are left out; all of them take an hour or two on a core.
