@@ -6,7 +6,6 @@ leans sideways in free space; in the last scene it leans on the wall. PyElastica
 """
 
 import argparse
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +16,10 @@ import record
 import torch
 from timing import best_rate, kernel_rate, sideways
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "rod"))
-from pyelastica_oracle import Loads, Post, as_cylinders, build
-
 from softgm_bench.config import compose
 from softgm_bench.envs.tasks import make_task
 from softgm_bench.rod.parameters import RodParameters
+from softgm_bench.rod.pyelastica_oracle import Loads, Post, as_cylinders, build
 
 ARM = RodParameters()
 BATCHES = (1, 16, 64, 256, 1024)

@@ -27,7 +27,8 @@ from parity_cases import (
     pyelastica_trajectory,
     together,
 )
-from pyelastica_oracle import Array
+
+from softgm_bench.rod.pyelastica_oracle import Array
 
 HEADER = (
     f"{'case':<28}{'s':>5}{'elements':>9}{'cylinders':>10}{'tip, m':>8}{'force, N':>9}"

@@ -33,10 +33,10 @@ from analytical import (
     tip_load,
 )
 from parity_cases import CASES, CPU_BACKENDS, Case
-from pyelastica_oracle import Loads, as_cylinders, build
 
 from softgm_bench.rod.backend import make_backend
 from softgm_bench.rod.parameters import RodParameters
+from softgm_bench.rod.pyelastica_oracle import Loads, as_cylinders, build
 from softgm_bench.rod.state import Cylinders, RodState, straight_rods
 
 Result = dict[str, Any]

@@ -10,13 +10,13 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from pyelastica_oracle import straight_rod
 from scipy.optimize import root
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from softgm_bench.rod.backend import make_backend
 from softgm_bench.rod.parameters import RodParameters
+from softgm_bench.rod.pyelastica_oracle import straight_rod
 from softgm_bench.rod.state import RodState, straight_rods
 
 Array = NDArray[np.float64]

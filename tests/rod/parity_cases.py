@@ -5,11 +5,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
-from pyelastica_oracle import UP, Array, Post, Trajectory, as_cylinders, simulate
 
 from softgm_bench.rod.actuation import Actuation
 from softgm_bench.rod.backend import make_backend
 from softgm_bench.rod.parameters import RodParameters
+from softgm_bench.rod.pyelastica_oracle import UP, Array, History, Post, as_cylinders, simulate
 from softgm_bench.rod.state import straight_rods
 
 CPU_BACKENDS = ("torch", "numba")
@@ -149,9 +149,10 @@ CASES = {
 }
 
 
-def pyelastica_trajectory(case: Case, pruning: bool = False) -> Trajectory:
+def pyelastica_trajectory(case: Case, pruning: bool = False) -> History:
     """What PyElastica computes; ``pruning`` as shipped, or every pair of element and cylinder."""
-    return simulate(case.parameters, case.couple(), case.steps, case.posts, case.force, pruning)
+    force = None if case.force is None else lambda step: case.force
+    return simulate(case.parameters, case.couple(), case.steps, case.posts, force, pruning)
 
 
 def together(cases: dict[str, Case]) -> Iterable[dict[str, Case]]:
@@ -185,6 +186,6 @@ def our_trajectories(backend: str, cases: dict[str, Case]) -> dict[str, dict[str
     }
 
 
-def largest_difference(ours: dict[str, Array], theirs: Trajectory, quantity: str = "position") -> float:
+def largest_difference(ours: dict[str, Array], theirs: History, quantity: str = "position") -> float:
     """Largest absolute difference over all steps and components."""
     return float(np.abs(ours[quantity] - getattr(theirs, quantity)).max())

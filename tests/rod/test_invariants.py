@@ -6,7 +6,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from parity_cases import CASES, CPU_BACKENDS, TWO_POSTS
-from pyelastica_oracle import Post, as_cylinders
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -14,6 +13,7 @@ from softgm_bench.rod.backend import Backend, make_backend
 from softgm_bench.rod.contact import contact_forces, element_radius
 from softgm_bench.rod.exact_contact import exact_contact_forces
 from softgm_bench.rod.parameters import RodParameters, rod_constants
+from softgm_bench.rod.pyelastica_oracle import Post, as_cylinders
 from softgm_bench.rod.state import Cylinders, RodState, straight_rods
 from softgm_bench.rod.torch_backend import (
     Motion,

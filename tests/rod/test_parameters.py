@@ -2,9 +2,9 @@ import elastica as ea
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from pyelastica_oracle import straight_rod
 
 from softgm_bench.rod.parameters import DAMPING_PROTOCOLS, RodParameters, rod_constants
+from softgm_bench.rod.pyelastica_oracle import straight_rod
 
 SOME_PARAMETERS = [
     RodParameters(),

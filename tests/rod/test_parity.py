@@ -14,9 +14,9 @@ from parity_cases import (
     pyelastica_trajectory,
     together,
 )
-from pyelastica_oracle import Array, Trajectory, simulate
 
 from softgm_bench.rod.parameters import RodParameters
+from softgm_bench.rod.pyelastica_oracle import Array, History, simulate
 
 TOUCHING = [name for name, case in CASES.items() if case.posts]
 MOVING = [name for name, case in CASES.items() if case.moves]
@@ -25,7 +25,7 @@ BOUNDS = dict(zip(QUANTITIES, (1e-11, 1e-11, 1e-8, 1e-8), strict=True))
 
 
 @cache
-def oracle(name: str) -> Trajectory:
+def oracle(name: str) -> History:
     return pyelastica_trajectory(CASES[name])
 
 

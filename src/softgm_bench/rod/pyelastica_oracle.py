@@ -1,4 +1,4 @@
-"""PyElastica 1.0.0 as the oracle of a rod's trajectory."""
+"""PyElastica 1.0.0 itself, driven as our backends are: the oracle of a rod's trajectory. An optional extra."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -18,21 +18,32 @@ UP = (0.0, 0.0, 1.0)
 
 
 class Post(NamedTuple):
+    """One fixed cylinder: the centre of one end, the unit vector to the other end, length and radius, m."""
+
     start: tuple[float, float, float]
     axis: tuple[float, float, float]
     length: float
     radius: float
 
 
-class Trajectory(NamedTuple):
-    """One entry per control step, taken at its end."""
+class History(NamedTuple):
+    """One entry per control step, taken at its end.
 
-    position: Array  # (steps, 3, n_nodes)
-    director: Array  # (steps, 3, 3, n_elements)
-    velocity: Array  # (steps, 3, n_nodes)
-    omega: Array  # (steps, 3, n_elements)
-    contact_force: Array  # (steps,), the largest force of the cylinders on any node within the step, N
-    missed: int  # contacts (cylinder and substep) that PyElastica's pruning did not, or would not, let through
+    Attributes:
+        position: m, ``(steps, 3, n_nodes)``.
+        director: rows d1, d2, d3, ``(steps, 3, 3, n_elements)``.
+        velocity: m/s, ``(steps, 3, n_nodes)``.
+        omega: in the material frame, rad/s, ``(steps, 3, n_elements)``.
+        contact_force: the largest force of the cylinders on any node within the step, N, ``(steps,)``.
+        missed: contacts (cylinder and substep) that PyElastica's pruning did not, or would not, let through.
+    """
+
+    position: Array
+    director: Array
+    velocity: Array
+    omega: Array
+    contact_force: Array
+    missed: int
 
 
 class _Simulator(ea.BaseSystemCollection, ea.Constraints, ea.Forcing, ea.Damping, ea.Contact):
@@ -40,9 +51,10 @@ class _Simulator(ea.BaseSystemCollection, ea.Constraints, ea.Forcing, ea.Damping
 
 
 class Loads:
-    """The couple of the current control step, changed in place, and a constant force."""
+    """Couple ``(3, n_elements)`` and force ``(3, n_nodes)`` of the current control step, changed in place."""
 
-    def __init__(self, couple: Array, force: Array | None = None):
+    def __init__(self, couple: Array, force: Array | None = None) -> None:
+        """Begin with these; without a force there never is one."""
         self.couple, self.force = couple, force
 
 
@@ -60,14 +72,15 @@ class _Given(ea.NoForces):
 
 
 class _LargestContactForce(ea.NoForces):
-    """Appended after the contacts: notes how much they added to the loads."""
+    """Appended after the contacts: notes how much they added to weight and loads."""
 
-    def __init__(self, record: list[float], loads: Array):
+    def __init__(self, record: list[float], weight: Array, loads: Loads):
         super().__init__()
-        self.record, self.loads = record, loads
+        self.record, self.weight, self.loads = record, weight, loads
 
     def apply_forces(self, system, time=0.0):
-        self.record[-1] = max(self.record[-1], float(np.abs(system.external_forces - self.loads).max()))
+        known = self.weight if self.loads.force is None else self.weight + self.loads.force
+        self.record[-1] = max(self.record[-1], float(np.abs(system.external_forces - known).max()))
 
 
 class _Pruning:
@@ -112,6 +125,7 @@ def _watched_pruning(apply: bool) -> Iterator[_Pruning]:
 
 
 def straight_rod(parameters: RodParameters) -> ea.CosseratRod:
+    """The arm at rest, as ``straight_rods`` has it."""
     return ea.CosseratRod.straight_rod(
         parameters.n_elements,
         np.zeros(3),
@@ -154,31 +168,34 @@ def simulate(
     couple: Callable[[int], Array],
     steps: int,
     posts: Sequence[Post] = (),
-    force: Array | None = None,
+    force: Callable[[int], Array] | None = None,
     pruning: bool = False,
-) -> Trajectory:
-    """Run ``steps`` control steps; ``couple(step)`` is ``(3, n_elements)`` and ``force`` ``(3, n_nodes)``.
+) -> History:
+    """Run ``steps`` control steps; ``couple(step)`` is ``(3, n_elements)`` and ``force(step)`` ``(3, n_nodes)``.
 
     PyElastica skips cylinders by bounding boxes, which miss contacts: only with ``pruning`` it does so here.
     """
-    loads = Loads(np.zeros((3, parameters.n_elements)), force)
+    push = np.zeros((3, parameters.n_nodes))
+    loads = Loads(np.zeros((3, parameters.n_elements)), None if force is None else push)
     simulator, rod = build(parameters, loads, posts)
-    constant = np.array(parameters.gravity)[:, None] * rod.mass + (0.0 if force is None else force)
+    weight = np.array(parameters.gravity)[:, None] * rod.mass
     largest: list[float] = []
-    simulator.add_forcing_to(rod).using(_LargestContactForce, record=largest, loads=constant)
+    simulator.add_forcing_to(rod).using(_LargestContactForce, record=largest, weight=weight, loads=loads)
     simulator.finalize()
 
     stepper, time, states = ea.PositionVerlet(), np.float64(0.0), []
     with _watched_pruning(pruning) as watched:
         for step in range(steps):
             loads.couple[...] = couple(step)
+            if force is not None:
+                push[...] = force(step)
             largest.append(0.0)
             for _ in range(parameters.substeps):
                 time = stepper.step(simulator, time, np.float64(parameters.dt))
             collections = (rod.position_collection, rod.director_collection, rod.velocity_collection)
             states.append([array.copy() for array in (*collections, rod.omega_collection)])
     position, director, velocity, omega = (np.stack(series) for series in zip(*states, strict=True))
-    return Trajectory(position, director, velocity, omega, np.array(largest), watched.missed)
+    return History(position, director, velocity, omega, np.array(largest), watched.missed)
 
 
 def _add_fixed_cylinder(
@@ -203,7 +220,7 @@ def _add_fixed_cylinder(
 
 
 def as_cylinders(per_environment: Sequence[Sequence[Post]], dtype: torch.dtype = torch.float64) -> Cylinders:
-    """Pad with masked cylinders to the longest list."""
+    """For our backends: one list of posts an environment, padded with masked cylinders to the longest."""
     size = max(map(len, per_environment))
     filler = Post((0.0, 0.0, 0.0), UP, 1.0, 1.0)  # as wide as the arm is long: an unread mask would show
     padded = [[*posts, *[filler] * (size - len(posts))] for posts in per_environment]
