@@ -4,6 +4,7 @@ SOURCE is a run folder, a checkpoint or a policy's file, of which an episode is 
 The end of each FILE's name says what it is: .png a still, .mp4, .webp or .gif a video, .html an interactive page.
 
   seed=0 episode=0       which episode of a policy is recorded
+  episodes=              of that evaluation: its size belongs to the seed; by default episode + 1
   horizon=  deterministic=true
   save=FILE.npz          keep the recorded episode
   step=                  moment of a still, in control steps; the last one by default
@@ -13,7 +14,7 @@ The end of each FILE's name says what it is: .png a still, .mp4, .webp or .gif a
   distance=              m: how far away the camera is; by default so that the whole episode fits
   attention=false        draw attention as edges from discovered bins to agents, as opaque as it is strong
   text=                  write time and distance; by default in videos only
-  threads=               for a video, by default all that there are
+  threads=               by default all that there are; an evaluation's episode has the bits of its number of threads
 
 Other settings change what the policy was trained with, e.g. task=wall_narrow or task.n_agents=8.
 """
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 
 KINDS = (".png", ".mp4", ".webp", ".gif", ".html")
 LARGEST = 4096  # pixels
-RECORDING = ("seed", "episode", "horizon", "deterministic")
+RECORDING = ("seed", "episode", "episodes", "horizon", "deterministic")
 
 
 @dataclass
@@ -42,6 +43,7 @@ class Options:
     out: str = ""
     seed: int | None = None
     episode: int | None = None
+    episodes: int | None = None
     horizon: int | None = None
     deterministic: bool | None = None
     save: str | None = None
@@ -70,7 +72,9 @@ def main(arguments: list[str]) -> None:
     files = _files(options)
     _check(options, files)
     from softgm_bench.experiment import trajectory as episodes  # late: what is refused should not wait
+    from softgm_bench.experiment.loop import set_threads
 
+    set_threads(options.threads)  # as an evaluation does: rounding depends on it
     if source.suffix == ".npz":
         given = [name for name in RECORDING if getattr(options, name) is not None]
         if given:
