@@ -3,7 +3,7 @@ PYTHON ?= python3.11
 BIN := .venv/bin
 STAMP := .venv/.setup
 
-.PHONY: setup train test test-slow check bench bench-gpu parity validation peers peers-setup report pictures
+.PHONY: setup train test test-slow check bench bench-gpu parity validation peers peers-setup report pictures docs
 
 setup: $(STAMP)
 
@@ -51,6 +51,10 @@ validation: setup
 # The example report, from the committed runs and evaluations.
 report: setup
 	$(BIN)/python -m softgm_bench.report experiments/trained evaluations=experiments/robustness out=experiments/report
+
+# The site, in build/site; warnings are errors. Read it with: python -m http.server -d build/site
+docs: setup
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
 # The pictures of docs/pictures, from the policies in experiments/policies.
 pictures: setup
