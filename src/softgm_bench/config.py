@@ -6,6 +6,7 @@ it against the dataclasses, so a misspelt key or a wrong type is refused whereve
 
 import os
 import re
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any, get_origin, get_type_hints
@@ -15,15 +16,17 @@ from hydra import initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
+from softgm_bench import plugins
+from softgm_bench.errors import UserError
+from softgm_bench.experiment.loggers.settings import LoggerConfig
 from softgm_bench.rod.parameters import RodParameters
 
 DTYPES = ("float64", "float32")
 OBSERVATIONS = ("standard", "oracle")
-
-
-class UserError(Exception):
-    """Something that the user can put right; the message is one line that says what, where and how."""
+GROUPS = ("task", "rod", "perturbation")  # chosen by name, which trained policies can be evaluated with others of
+CHANGEABLE = (*GROUPS, "backend", "dtype")
 
 
 @dataclass
@@ -73,11 +76,14 @@ class Config:
     threads: int | None
     run_dir: str
     overwrite: bool
+    resume: bool
     task: Any
     algo: Any
     model: Any
     rod: RodParameters
     experiment: ExperimentConfig
+    perturbation: Any  # a PerturbationConfig, which brings torch along
+    logger: LoggerConfig
 
     @property
     def oracle(self) -> bool:
@@ -87,16 +93,17 @@ class Config:
     @property
     def label(self) -> str:
         """The algorithm's name as results carry it."""
-        return labelled(self.algo.name, plain(self)["model"]["name"], self.observation)
+        return labelled(self.algo.name, plain(self)["model"]["name"], self.observation, self.perturbation.name)
 
 
-def labelled(algo: str, model: str, observation: str) -> str:
-    """``algo``, and whatever in model and observation makes its results another kind's.
+def labelled(algo: str, model: str, observation: str, perturbation: str) -> str:
+    """``algo``, and whatever in model, observation and perturbation makes its results another kind's.
 
     SoftGM and its ablations have the model that they are named after, the other algorithms an MLP; any other is named.
     """
     own = "softgm" if algo.startswith("softgm") else "mlp"
-    return "_".join([algo, *([] if model == own else [model]), *([] if observation == "standard" else [observation])])
+    usual = {own: model, "standard": observation, "none": perturbation}
+    return "_".join([algo, *(value for default, value in usual.items() if value != default)])
 
 
 # For conf/config.yaml: the run folder's name.
@@ -137,6 +144,8 @@ def typed(composed: DictConfig) -> Config:
     OmegaConf.set_struct(values, False)
     if "run_dir" in composed:
         values.run_dir = composed.run_dir  # which may name the model, as the key that goes below
+    schema.perturbation = _perturbation_schema()
+    schema.resume = False  # of runs from before there was such a key
     for group, schemas in _group_schemas().items():
         name = OmegaConf.select(composed, f"{group}.name")
         if name not in schemas:
@@ -164,6 +173,38 @@ def plain(config: Config) -> dict[str, Any]:
             (name,) = (name for name, schema in schemas.items() if schema is type(getattr(config, group)))
             values[group] = {"name": name} | values[group]
     return values
+
+
+def changed(values: Mapping[str, Any], overrides: Sequence[str]) -> Config:
+    """A run's configuration with other settings for the policy that it has trained; not validated.
+
+    Args:
+        values: what ``plain`` gave.
+        overrides: ``key=value`` each. The name of a group replaces all of the group by what ``conf/`` says, whatever
+            stands where; then dotted keys change single values, the last one of a key last.
+
+    Raises:
+        UserError: a setting that cannot be read, or that training has settled.
+        HydraException, OmegaConfBaseException: an unknown group, a misspelt key or a wrong type.
+    """
+    settings = OmegaConf.create(dict(values))
+    single: list[str] = []
+    for override in overrides:
+        key, equals, name = override.partition("=")
+        if not equals:
+            raise UserError(f"{override}: settings are written key=value")
+        if key.partition(".")[0] not in CHANGEABLE:
+            raise UserError(f"{key}: not a setting of trained policies; those are {', '.join(CHANGEABLE)}")
+        if key not in GROUPS:
+            single.append(override)
+        elif re.fullmatch(r"\w+", name):
+            settings[key] = compose_untyped([override])[key]
+        else:
+            raise UserError(f"{override}: name one of the files in conf/{key}")
+    try:
+        return typed(OmegaConf.merge(settings, OmegaConf.from_dotlist(single)))  # type: ignore[arg-type]
+    except YAMLError as error:
+        raise UserError(f"{', '.join(single)}: a value that cannot be read") from error
 
 
 def validate(config: Config) -> None:
@@ -214,8 +255,6 @@ def available_threads() -> int:
 
 
 def _validate_machine(config: Config) -> None:
-    import torch
-
     from softgm_bench.rod.backend import BACKENDS
 
     cores = available_threads()
@@ -225,17 +264,26 @@ def _validate_machine(config: Config) -> None:
         raise UserError(f"backend={config.backend}: choose one of {', '.join(BACKENDS)}, or null")
     if config.dtype not in DTYPES:
         raise UserError(f"dtype={config.dtype}: choose one of {', '.join(DTYPES)}")
-    device = re.fullmatch(r"cpu|cuda(?::(\d+))?", config.device)
-    if device is None:
-        raise UserError(f"device={config.device}: choose cpu, cuda or cuda:<index>")
-    if config.device == "cpu":
-        if config.backend == "cuda":
-            raise UserError("backend=cuda runs on a CUDA device: add device=cuda, or choose backend=numba")
-        return
-    if config.backend == "numba":
+    if config.device == "cpu" and config.backend == "cuda":
+        raise UserError("backend=cuda runs on a CUDA device: add device=cuda, or choose backend=numba")
+    if config.device != "cpu" and config.backend == "numba":
         raise UserError(f"device={config.device}: backend=numba runs on the CPU; choose backend=cuda, torch or null")
-    if int(device.group(1) or 0) >= torch.cuda.device_count():
-        raise UserError(f"device={config.device}: this machine has {torch.cuda.device_count()} CUDA devices")
+    validate_device(config.device)
+
+
+def validate_device(device: str) -> None:
+    """Refuse a device that there is not.
+
+    Raises:
+        UserError: saying what there is.
+    """
+    import torch
+
+    cuda = re.fullmatch(r"cpu|cuda(?::(\d+))?", device)
+    if cuda is None:
+        raise UserError(f"device={device}: choose cpu, cuda or cuda:<index>")
+    if device != "cpu" and int(cuda.group(1) or 0) >= torch.cuda.device_count():
+        raise UserError(f"device={device}: this machine has {torch.cuda.device_count()} CUDA devices")
 
 
 def _validate_by_building(config: Config) -> None:
@@ -262,6 +310,7 @@ def _validate_by_building(config: Config) -> None:
                 backend=config.backend,
                 dtype=dtype_of(config),
                 curriculum=True,
+                perturbation=config.perturbation,
             )
         observed = set(env.observation_spec.keys(True, True))
         encoder = build_encoder(config.model, env.n_agents, env.n_slots)
@@ -281,16 +330,18 @@ def _validate_vmas(config: Config) -> None:
     task = f"task={config.task.name}"
     if config.device != "cpu":
         raise ValueError(f"device={config.device}: {task} runs on the CPU")
+    if not config.perturbation.nothing:
+        raise ValueError(f"perturbation={config.perturbation.name}: {task} has no arm; it must be none")
     if config.oracle:
         raise ValueError(f"observation=oracle: {task} has nothing that an oracle would be told")
     needing_memory = {
         "algo.noise_correlation": getattr(config.algo, "noise_correlation", 0.0),
-        "algo.actor.persistence": getattr(config.algo.actor, "persistence", 0.0),
+        "algo.actor.persistence": getattr(getattr(config.algo, "actor", None), "persistence", 0.0),
     }
     for key, value in needing_memory.items():
         if value:
             raise ValueError(f"{key} is {value}: {task} does not show agents their previous action; it must be 0")
-    if config.algo.critic.mlp is not None:
+    if getattr(getattr(config.algo, "critic", None), "mlp", None) is not None:
         raise ValueError(f"algo.critic.mlp: it reads the arm's observation, which {task} has not; it must be null")
 
 
@@ -301,8 +352,16 @@ def _group_schemas() -> dict[str, dict[str, type]]:
     from softgm_bench.envs.vmas import SCENARIOS, VmasConfig
     from softgm_bench.models.registry import model_configs
 
+    plugins.load()
     tasks = {**TASK_CONFIGS, **dict.fromkeys(SCENARIOS, VmasConfig)}
     return {"task": tasks, "algo": algorithm_configs(), "model": model_configs()}
+
+
+def _perturbation_schema() -> DictConfig:
+    """Of every perturbation; runs from before there were any get the default, none."""
+    from softgm_bench.envs.perturbation import PerturbationConfig
+
+    return _schema(PerturbationConfig)
 
 
 def _schema(cls: type) -> DictConfig:
@@ -310,18 +369,18 @@ def _schema(cls: type) -> DictConfig:
     node = OmegaConf.structured(cls)
     OmegaConf.set_readonly(node, False)
     hints = get_type_hints(cls)
-    for field in fields(cls):
-        if is_dataclass(hints[field.name]):
-            node[field.name] = _schema(hints[field.name])
+    for item in fields(cls):
+        if is_dataclass(hints[item.name]):
+            node[item.name] = _schema(hints[item.name])
     return node
 
 
 def _restore_tuples(instance: Any) -> None:
     """Turn the lists that OmegaConf leaves in fields of type tuple back, so that frozen dataclasses can be hashed."""
     hints = get_type_hints(type(instance))
-    for field in fields(instance):
-        value = getattr(instance, field.name)
+    for item in fields(instance):
+        value = getattr(instance, item.name)
         if is_dataclass(value):
             _restore_tuples(value)
-        elif get_origin(hints[field.name]) is tuple:
-            object.__setattr__(instance, field.name, tuple(value))
+        elif get_origin(hints[item.name]) is tuple:
+            object.__setattr__(instance, item.name, tuple(value))

@@ -9,7 +9,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from softgm_bench.algorithms import algorithm_configs
 from softgm_bench.config import UserError, compose, compose_untyped, config_directory, dtype_of, plain, typed
-from softgm_bench.envs import make_env
+from softgm_bench.envs import PerturbationConfig, make_env
 from softgm_bench.envs.tasks import TASK_CONFIGS
 from softgm_bench.experiment.explain import USER_ERRORS, explain
 from softgm_bench.rod.numba_backend import NumbaBackend
@@ -139,6 +139,43 @@ def test_an_oracle_says_so_wherever_its_results_go():
         "run_dir=here with observation=oracle: put the word"
     )
     assert not compose([]).oracle
+
+
+def test_what_was_trained_under_a_perturbation_says_so_wherever_its_results_go():
+    for name in ("noise", "section_failure", "disturbance"):
+        config = compose([f"perturbation={name}", "algo=masac"])
+        assert config.label == f"masac_{name}"
+        assert config.run_dir == f"outputs/basic/masac_{name}/seed0"
+        assert not config.perturbation.nothing
+    assert compose(["perturbation=noise", "perturbation.name=fog"]).label == "softgm_fog"
+    assert compose([]).perturbation == PerturbationConfig()
+
+
+def test_perturbations_are_the_papers_and_every_number_can_be_set():
+    paper = [compose([f"perturbation={name}"]).perturbation for name in ("noise", "section_failure", "disturbance")]
+    assert paper == [
+        PerturbationConfig("noise", position_sigma=0.1, velocity_sigma=0.1, action_sigma=0.2),
+        PerturbationConfig("section_failure", failed_agents=(2,)),
+        PerturbationConfig("disturbance", tip_force=15.0, first_step=5, steps=6),
+    ]
+    config = compose(["perturbation=noise", "perturbation.position_sigma=0.05", "perturbation.failed_agents=[0,5]"])
+    assert config.perturbation == PerturbationConfig("noise", 0.05, 0.1, 0.2, (0, 5))
+
+
+def test_mistakes_in_perturbations_are_one_line():
+    assert refusal("perturbation=nois").startswith("perturbation=nois: no such perturbation; choose one of disturbance")
+    assert refusal("perturbation.sigma=1").startswith("perturbation.sigma: no such key; did you mean perturbation.")
+    assert refusal("perturbation.position_sigma=1").startswith("perturbation.position_sigma is 1.0 with perturbation=")
+    absent = refusal("perturbation=section_failure", "perturbation.failed_agents=[7]")
+    assert absent == "perturbation.failed_agents holds 7: the 6 agents are 0 to 5"
+    vmas = refusal("perturbation=noise", "task=vmas_balance", "model=vector_mlp")
+    assert vmas == "perturbation=noise: task=vmas_balance has no arm; it must be none"
+
+
+def test_runs_from_before_there_were_perturbations_had_none():
+    values = plain(compose([]))
+    del values["perturbation"]
+    assert typed(OmegaConf.create(values)) == compose([])
 
 
 def test_the_arm_is_its_dataclass_unless_told_otherwise():

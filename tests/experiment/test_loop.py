@@ -55,6 +55,21 @@ def test_metrics_repeat_with_the_seed_however_often_training_is_looked_at(tmp_pa
     assert all(one["episode_return"] != another["episode_return"] for one, another in zip(first, other, strict=True))
 
 
+def test_a_perturbation_acts_in_training_too_and_its_state_is_kept(tmp_path):
+    plain = trained(tmp_path / "plain", "task=wall")
+    noisy = trained(tmp_path / "noisy", "task=wall", "perturbation=noise")
+    again = trained(tmp_path / "again", "task=wall", "perturbation=noise")
+
+    assert noisy == again
+    assert all(one["loss_critic"] != other["loss_critic"] for one, other in zip(plain, noisy, strict=True))
+    assert json.loads((tmp_path / "noisy/summary.json").read_text())["algo"] == "softgm_noise"
+    generators = [
+        checkpoint.load(checkpoint.latest(tmp_path / name / "checkpoints"))["environment"]["generator"]
+        for name in ("plain", "noisy")
+    ]
+    assert generators[1].shape == (2, *generators[0].shape)
+
+
 def test_a_finished_run_holds_what_its_settings_promise(tmp_path):
     summary = train(compose([*TINY, f"run_dir={tmp_path}", "task=structured", "experiment.total_frames=33"]))
 

@@ -17,14 +17,18 @@ FORMAT = 1
 def save(folder: Path, frames: int, state: Mapping[str, Any], keep: int) -> Path:
     """Write the state after ``frames`` frames to ``folder`` and remove all but the newest ``keep`` checkpoints.
 
+    Checkpoints after more frames go too: they are of a continuation that was given up, because they are damaged.
+
     ``state`` holds tensors and plain Python values only: it is read back with ``weights_only=True``.
     """
     buffer = io.BytesIO()  # a full disk then shows as an OSError, which torch's own file writing hides
     torch.save({"format": FORMAT, "frames": frames, **state}, buffer)
     path = folder / f"frames-{frames:012d}.pt"
     write_atomically(path, buffer.getvalue())
-    for old in _all(folder)[:-keep]:
-        old.unlink()
+    newest = [other for other in in_order(folder) if other <= path][-keep:]
+    for other in in_order(folder):
+        if other not in newest:
+            other.unlink()
     return path
 
 
@@ -52,7 +56,7 @@ def load(path: Path, device: str = "cpu") -> dict[str, Any]:
 
 def latest(folder: Path) -> Path | None:
     """The newest checkpoint in ``folder``."""
-    return max(_all(folder), default=None)
+    return max(in_order(folder), default=None)
 
 
 def random_state() -> dict[str, Any]:
@@ -60,6 +64,13 @@ def random_state() -> dict[str, Any]:
     return {"cpu": torch.get_rng_state(), "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else []}
 
 
-def _all(folder: Path) -> list[Path]:
-    """Checkpoints, oldest first."""
+def set_random_state(state: Mapping[str, Any]) -> None:
+    """Go on drawing from what ``random_state`` returned."""
+    torch.set_rng_state(state["cpu"])
+    if state["cuda"] and torch.cuda.is_available():
+        torch.cuda.set_rng_state_all(state["cuda"])
+
+
+def in_order(folder: Path) -> list[Path]:
+    """Checkpoints in ``folder``, oldest first."""
     return sorted(folder.glob("frames-*.pt"))

@@ -5,24 +5,27 @@ import math
 import platform
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 import torch
-from tensordict import TensorDictBase
-from torchrl.collectors import Collector
-from torchrl.envs.utils import ExplorationType
+from tensordict import TensorDict, TensorDictBase
 
 from softgm_bench.algorithms import Algorithm, build_algorithm
-from softgm_bench.config import Config, UserError, available_threads, dtype_of, plain
-from softgm_bench.envs import SoftArmEnv, make_env
-from softgm_bench.envs.vmas import VmasConfig, VmasEnv
-from softgm_bench.experiment import checkpoint, run_folder
+from softgm_bench.config import Config, UserError, available_threads, plain
+from softgm_bench.envs import SoftArmEnv
+from softgm_bench.envs.vmas import VmasEnv
+from softgm_bench.experiment import checkpoint, resume, run_folder
+from softgm_bench.experiment.collection import FrameCollector
+from softgm_bench.experiment.environment import build_env
 from softgm_bench.experiment.evaluation import DISCOUNT, EpisodeRecords, evaluate
 from softgm_bench.experiment.interruption import Interrupted, Interruption
+from softgm_bench.experiment.loggers.guarded import Loggers
+from softgm_bench.experiment.loggers.video import episode_video
 from softgm_bench.experiment.metrics import CsvWriter, EpisodeTracker, step_metrics
 from softgm_bench.experiment.progress import Progress
 from softgm_bench.experiment.run_folder import RunFolder
@@ -45,6 +48,7 @@ class Run:
     """A run under way.
 
     Attributes:
+        started: when it would have begun if it had never been broken off, on the clock of ``time.perf_counter``.
         frames: control steps of single environments that the policy has learnt from.
         evaluations: made so far.
     """
@@ -54,40 +58,85 @@ class Run:
     seeds: Seeds
     env: SoftArmEnv | VmasEnv
     algorithm: Algorithm
+    collector: FrameCollector
     episodes: EpisodeTracker
     started: float
     iteration: int = 0
     frames: int = 0
     evaluations: int = 0
+    loggers: Loggers = field(init=False)
 
     @property
     def wall_time(self) -> float:
-        """Seconds since the run began."""
+        """Seconds since the run began, without those between being broken off and going on."""
         return time.perf_counter() - self.started
+
+    @property
+    def evaluations_due(self) -> int:
+        """How many evaluations ``evaluation.interval`` asks for by now, at most one an iteration."""
+        return min(self.iteration, self.frames // self.config.experiment.evaluation.interval)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that going on needs, and what it belongs to: tensors and plain Python values."""
+        return {
+            "algorithm": self.algorithm.state_dict(),
+            "random": checkpoint.random_state(),
+            "environment": {
+                "generator": self.env.generator_state(),
+                "simulation": self.env.simulation_state().to_dict(),
+                "shown": self.collector.shown(),
+            },
+            "episodes": self.episodes.state_dict(),
+            "counters": {"iteration": self.iteration, "evaluations": self.evaluations, "wall_time": self.wall_time},
+            "config": plain(self.config),
+            "versions": versions(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from a checkpoint: what ``state_dict`` returned, and ``frames``."""
+        self.algorithm.load_state_dict(state["algorithm"])
+        environment, counters = state["environment"], state["counters"]
+        simulation = TensorDict(environment["simulation"], self.env.batch_size, device=self.env.device)
+        self.env.load_simulation_state(simulation)
+        self.env.set_generator_state(environment["generator"])
+        self.collector.show(environment["shown"])
+        self.episodes.load_state_dict(state["episodes"])
+        self.iteration, self.evaluations = counters["iteration"], counters["evaluations"]
+        self.frames = state["frames"]
+        self.started -= counters["wall_time"]
+        checkpoint.set_random_state(state["random"])  # last: nothing draws any more
 
 
 def train(config: Config) -> dict[str, Any]:
-    """Run a checked configuration from beginning to end and return what ``summary.json`` holds.
+    """Run a checked configuration to its end, from its beginning or, with ``resume``, from its newest checkpoint.
+
+    Returns:
+        What ``summary.json`` holds.
 
     Raises:
-        UserError: the run folder cannot be used, or not any longer.
+        UserError: the run folder cannot be used, or not any longer, or holds a run with other settings.
         Interrupted: SIGINT or SIGTERM; a checkpoint of the last whole iteration is left.
     """
-    run = _begin(config)
+    if config.resume and (summary := resume.finished(config, total_frames(config))) is not None:
+        return summary
+    run = _build(config)
     try:
-        records = _go(run)
-        return _finish(run, records)
+        with run_folder.exclusive(config.run_dir):
+            _begin(run)
+            with Loggers(config, run.folder.path, run.frames) as run.loggers:
+                records = _go(run)
+                return _finish(run, records)
     except OSError as error:  # a full disk, or a folder taken away
-        raise UserError(
-            f"{error.filename or run.folder.path}: {error.strerror}; earlier checkpoints are whole"
-        ) from error
+        place = error.filename or run.folder.path
+        raise UserError(f"{place}: {error.strerror}; earlier checkpoints are whole, resume=true goes on") from error
+    finally:
+        run.collector.shutdown()
 
 
 def _go(run: Run) -> EpisodeRecords:
     """Train, then evaluate; an interruption leaves a checkpoint."""
     config = run.config
-    total = _iterations(config) * _frames_per_iteration(config)
-    with Interruption() as interruption, Progress(total) as progress:
+    with Interruption() as interruption, Progress(total_frames(config), run.frames) as progress:
         try:
             _learn(run, interruption, progress)
             _save(run)
@@ -97,7 +146,7 @@ def _go(run: Run) -> EpisodeRecords:
                 seed = run.seeds.final_evaluation
                 return _evaluate(run, settings.final_episodes, seed, settings.final_horizon)
         except Interrupted as stop:
-            stop.args = (f"interrupted after {run.frames} frames; checkpoint: {_save(run)}",)
+            stop.args = (f"interrupted after {run.frames} frames, resume=true goes on; checkpoint: {_save(run)}",)
             raise
 
 
@@ -127,44 +176,38 @@ def keep_memory() -> None:
         libc.mallopt(M_MMAP_THRESHOLD, 2**25)  # the largest that glibc accepts
 
 
-def _begin(config: Config) -> Run:
+def _build(config: Config) -> Run:
+    """A run at its beginning; nothing is written yet."""
     started = time.perf_counter()
     seeds = derive_seeds(config.seed)
     set_threads(config.threads)
     keep_memory()
     torch.manual_seed(seeds.torch)
     experiment = config.experiment
-    env = _make_env(config, experiment.num_envs, seeds.training, experiment.train_horizon, training=True)
+    env = build_env(config, experiment.num_envs, seeds.training, experiment.train_horizon, training=True)
     try:
         algorithm = build_algorithm(config.algo, config.model, env, config.oracle)
     except ValueError as error:  # settings that do not fit together
         raise UserError(str(error)) from error
-    folder = run_folder.create(config.run_dir, plain(config), config.overwrite)
-    return Run(config, folder, seeds, env, algorithm, EpisodeTracker(experiment.num_envs, config.device), started)
+    collector = FrameCollector(env, algorithm.policy, _frames_per_iteration(config))
+    episodes = EpisodeTracker(experiment.num_envs, config.device)
+    return Run(config, RunFolder(Path(config.run_dir)), seeds, env, algorithm, collector, episodes, started)
 
 
-def _make_env(
-    config: Config, num_envs: int, seed: int, horizon: int | None, training: bool = False
-) -> SoftArmEnv | VmasEnv:
-    if isinstance(config.task, VmasConfig):
-        return VmasEnv(config.task, num_envs, seed, horizon)
-    return make_env(
-        config.task,
-        config.rod,
-        num_envs=num_envs,
-        seed=seed,
-        horizon=horizon,
-        device=config.device,
-        backend=config.backend,
-        dtype=dtype_of(config),
-        stagger=training,
-        curriculum=training,
-    )
+def _begin(run: Run) -> None:
+    """Make the run's folder, or go on with the run in it."""
+    config = run.config
+    state = resume.newest_state(config) if config.resume else None
+    if state is None:
+        run_folder.create(config.run_dir, plain(config), config.overwrite or config.resume)
+    else:
+        resume.restore(run, state)
 
 
 def _learn(run: Run, interruption: Interruption, progress: Progress) -> None:
     experiment = run.config.experiment
-    with CsvWriter(run.folder.metrics) as metrics:
+    with CsvWriter(run.folder.metrics, append=run.iteration > 0) as metrics:
+        _evaluate_if_due(run, interruption, progress)  # one that the signal before a resumption broke off
         began = time.perf_counter()
         for batch in _batches(run):
             losses = run.algorithm.update(batch)
@@ -172,38 +215,30 @@ def _learn(run: Run, interruption: Interruption, progress: Progress) -> None:
             run.frames += batch.numel()
             row = _row(run, batch, losses, time.perf_counter() - began)
             metrics.write(row)
+            run.loggers.metrics(row)
             progress.advance(batch.numel(), row.get("success_rate", math.nan))
             interruption.check()
-            if _crossed(experiment.evaluation.interval, run.frames, batch.numel()):
-                _evaluate_in_training(run, interruption, progress)
+            _evaluate_if_due(run, interruption, progress)
             if _crossed(experiment.checkpoint.interval, run.frames, batch.numel()):
                 _save(run)
             began = time.perf_counter()
 
 
 def _batches(run: Run) -> Iterator[TensorDictBase]:
-    """As many batches ``(num_envs, steps)`` as the run has iterations, each sampled from the current policy."""
-    collector = Collector(
-        run.env,
-        run.algorithm.policy,
-        frames_per_batch=_frames_per_iteration(run.config),
-        total_frames=_iterations(run.config) * _frames_per_iteration(run.config),
-        exploration_type=ExplorationType.RANDOM,
-        auto_register_policy_transforms=False,
-        track_traj_ids=False,  # nobody reads them, and counting them would wait for the device at every step
-    )
-    try:
-        yield from collector
-    finally:
-        collector.shutdown()
+    """A batch ``(num_envs, steps)`` for each iteration that is left, sampled from the current policy."""
+    batches = iter(run.collector)
+    while run.frames < total_frames(run.config):
+        yield next(batches)
+
+
+def total_frames(config: Config) -> int:
+    """Frames of a run: those that are asked for, rounded up to whole iterations."""
+    frames = _frames_per_iteration(config)
+    return -(-config.experiment.total_frames // frames) * frames
 
 
 def _frames_per_iteration(config: Config) -> int:
     return config.experiment.num_envs * config.experiment.steps_per_batch
-
-
-def _iterations(config: Config) -> int:
-    return -(-config.experiment.total_frames // _frames_per_iteration(config))
 
 
 def _crossed(interval: int, frames: int, new_frames: int) -> bool:
@@ -224,12 +259,14 @@ def _row(run: Run, batch: TensorDictBase, losses: dict[str, float], seconds: flo
 
 
 def _evaluate(run: Run, episodes: int, seed: int, horizon: int | None) -> EpisodeRecords:
-    env = _make_env(run.config, episodes, seed, horizon)
+    env = build_env(run.config, episodes, seed, horizon)
     deterministic = run.config.experiment.evaluation.deterministic
     return evaluate(run.algorithm.policy, env, deterministic=deterministic, seed=seed)
 
 
-def _evaluate_in_training(run: Run, interruption: Interruption, progress: Progress) -> None:
+def _evaluate_if_due(run: Run, interruption: Interruption, progress: Progress) -> None:
+    if run.evaluations == run.evaluations_due:
+        return
     with interruption.at_once():
         settings = run.config.experiment.evaluation
         records = _evaluate(run, settings.episodes, run.seeds.evaluation, settings.horizon)
@@ -238,6 +275,7 @@ def _evaluate_in_training(run: Run, interruption: Interruption, progress: Progre
     at = {"evaluation": run.evaluations, "iteration": run.iteration, "frames": run.frames, "wall_time": run.wall_time}
     with run.folder.evaluations.open("a") as file:
         file.write(run_folder.to_json(at | metrics) + "\n")
+    run.loggers.evaluation(run.frames, metrics)
     value, length = metrics["undiscounted_return"]["mean"], metrics["episode_length"]["mean"]
     achieved = f"success {metrics['success_rate']['mean']:.2f}" if "success_rate" in metrics else f"return {value:.2f}"
     oracle = " (oracle)" if run.config.oracle else ""
@@ -245,19 +283,9 @@ def _evaluate_in_training(run: Run, interruption: Interruption, progress: Progre
 
 
 def _save(run: Run) -> Path:
-    state = {
-        "algorithm": run.algorithm.state_dict(),
-        "random": checkpoint.random_state(),
-        "environment": {
-            "generator": run.env.generator_state(),
-            "simulation": run.env.simulation_state().to_dict(),
-        },
-        "episodes": run.episodes.state_dict(),
-        "counters": {"iteration": run.iteration, "evaluations": run.evaluations, "wall_time": run.wall_time},
-        "config": plain(run.config),
-        "versions": versions(),
-    }
-    return checkpoint.save(run.folder.checkpoints, run.frames, state, run.config.experiment.checkpoint.keep)
+    run_folder.to_disk(run.folder)  # what a checkpoint goes on from must not be lost where it is not
+    keep = run.config.experiment.checkpoint.keep
+    return checkpoint.save(run.folder.checkpoints, run.frames, run.state_dict(), keep)
 
 
 def _finish(run: Run, records: EpisodeRecords) -> dict[str, Any]:
@@ -283,4 +311,6 @@ def _finish(run: Run, records: EpisodeRecords) -> dict[str, Any]:
     run_folder.write_atomically(run.folder.summary, (run_folder.to_json(summary, indent=2) + "\n").encode())
     print(table(metrics, f"{config.label} on {config.task.name}, seed {config.seed}, {run.frames} frames:"))
     print(f"run folder: {run.folder.path}")
+    video = partial(episode_video, config, run.algorithm.policy, run.frames)
+    run.loggers.finish(run.frames, metrics, records.rows(), video)
     return summary

@@ -15,12 +15,16 @@ Row = Mapping[str, float | int]
 
 
 class CsvWriter:
-    """Appends rows to a new CSV file, each on disk before the next begins. The first row names the columns."""
+    """Appends rows to a CSV file, each written out before the next begins. The first row names the columns."""
 
-    def __init__(self, path: Path) -> None:
-        """Create the file, or empty it."""
-        self._file = path.open("w", newline="")
+    def __init__(self, path: Path, append: bool = False) -> None:
+        """Create the file, or empty it; with ``append``, go on after the rows that it holds."""
+        self._file = path.open("a+" if append else "w", newline="")
         self._writer: csv.DictWriter | None = None
+        if append:
+            self._file.seek(0)  # writing is at the end, wherever reading is
+            names = next(csv.reader(self._file), None)
+            self._writer = None if names is None else csv.DictWriter(self._file, names, lineterminator="\n")
 
     def write(self, row: Row) -> None:
         """Append a row; it must have the columns of the first."""
@@ -77,6 +81,11 @@ class EpisodeTracker:
     def state_dict(self) -> dict[str, torch.Tensor]:
         """What the episodes under way have gathered."""
         return {"return": self._return, "length": self._length}
+
+    def load_state_dict(self, state: Mapping[str, torch.Tensor]) -> None:
+        """Go on from what ``state_dict`` returned for as many environments."""
+        self._return.copy_(state["return"])
+        self._length.copy_(state["length"])
 
 
 def step_metrics(batch: TensorDictBase) -> dict[str, float]:

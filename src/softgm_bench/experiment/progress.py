@@ -4,7 +4,7 @@ import math
 import sys
 import time
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from tqdm import tqdm
 
@@ -14,13 +14,14 @@ SECONDS_BETWEEN_LINES = 10.0
 class Progress:
     """Frames, frames/s, success rate and time left, on stderr."""
 
-    def __init__(self, total_frames: int) -> None:
-        """Begin at zero frames."""
+    def __init__(self, total_frames: int, frames: int = 0) -> None:
+        """Begin after ``frames`` frames."""
         self._total = total_frames
-        self._frames = 0
+        self._first = self._frames = frames
         self._success = "-"
         self._started = self._printed = time.perf_counter()
-        self._bar = tqdm(total=total_frames, unit=" frames", unit_scale=True, dynamic_ncols=True, disable=None)
+        style: dict[str, Any] = {"unit": " frames", "unit_scale": True, "dynamic_ncols": True, "disable": None}
+        self._bar = tqdm(total=total_frames, initial=frames, **style)
 
     def advance(self, frames: int, success_rate: float) -> None:
         """``frames`` more have been learnt from; the success rate is theirs, NaN if no episode ended."""
@@ -32,7 +33,7 @@ class Progress:
         now = time.perf_counter()
         if self._bar.disable and (now - self._printed > SECONDS_BETWEEN_LINES or self._frames >= self._total):
             self._printed = now
-            rate = self._frames / (now - self._started)
+            rate = (self._frames - self._first) / (now - self._started)
             left = tqdm.format_interval((self._total - self._frames) / rate)
             share = self._frames / self._total
             self.say(f"{share:4.0%}  {self._frames} frames  {rate:.0f} frames/s  success {self._success}  {left} left")

@@ -3,7 +3,8 @@
 import json
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,8 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from softgm_bench.config import UserError
+
+ANEW = "to begin anew, give overwrite=true instead of resume=true"
 
 
 @dataclass(frozen=True)
@@ -59,14 +62,63 @@ def create(run_dir: str, config: Mapping[str, Any], overwrite: bool) -> RunFolde
     folder = RunFolder(Path(run_dir))
     held = _held_run(folder)
     if held and not overwrite:
-        raise UserError(f"run_dir={run_dir} holds {held}: add overwrite=true to replace it or choose another run_dir")
+        going_on = "" if folder.summary.exists() else "resume=true to go on with it, "
+        advice = f"add {going_on}overwrite=true to replace it or choose another run_dir"
+        raise UserError(f"run_dir={run_dir} holds {held}: {advice}")
     try:
         _remove_run(folder)
         folder.checkpoints.mkdir(parents=True, exist_ok=True)
-        write_atomically(folder.config, OmegaConf.to_yaml(OmegaConf.create(dict(config))).encode())
+        write_atomically(folder.config, _yaml(config))
     except OSError as error:
-        raise UserError(f"run_dir={run_dir}: {error.strerror}; choose a folder that can be written") from error
+        raise _unwritable(run_dir, error) from error
     return folder
+
+
+def cut_back(folder: RunFolder, config: Mapping[str, Any], iterations: int, evaluations: int) -> None:
+    """Bring the files of a run back to where a checkpoint left them.
+
+    Args:
+        folder: of the run.
+        config: its settings, of which some may be others than when it began.
+        iterations: that ``metrics.csv`` tells of when the checkpoint is written.
+        evaluations: that ``evaluations.jsonl`` does.
+
+    Raises:
+        UserError: one of the two tells of fewer.
+        OSError: the folder cannot be written.
+    """
+    _keep_lines(folder.metrics, 1 + iterations if iterations else 0)
+    _keep_lines(folder.evaluations, evaluations)
+    for path in (folder.summary, folder.episodes, *_left_over(folder)):
+        path.unlink(missing_ok=True)
+    write_atomically(folder.config, _yaml(config))
+
+
+@contextmanager
+def exclusive(run_dir: str) -> Iterator[None]:
+    """Keep other processes out of a run's folder; the system lets them in again however this one ends.
+
+    Raises:
+        UserError: another process is in it, or the folder cannot be made.
+    """
+    try:
+        Path(run_dir).mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(run_dir, os.O_RDONLY)
+    except OSError as error:
+        raise _unwritable(run_dir, error) from error
+    try:
+        with suppress(ImportError):  # on Windows there is no such lock
+            _lock(descriptor, run_dir)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def to_disk(folder: RunFolder) -> None:
+    """Wait until the rows and lines written so far would survive a power failure."""
+    for path in (folder.metrics, folder.evaluations, folder.path):
+        if path.exists():
+            _fsync(path)
 
 
 def write_atomically(path: Path, content: bytes) -> None:
@@ -81,16 +133,51 @@ def write_atomically(path: Path, content: bytes) -> None:
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
-    directory = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(directory)
-    finally:
-        os.close(directory)
+    _fsync(path.parent)
 
 
 def to_json(value: Mapping[str, Any], indent: int | None = None) -> str:
     """JSON text; numbers that are not finite become null, which JSON has a word for."""
     return json.dumps(_finite(value), indent=indent, allow_nan=False)
+
+
+def _yaml(config: Mapping[str, Any]) -> bytes:
+    return OmegaConf.to_yaml(OmegaConf.create(dict(config))).encode()
+
+
+def _fsync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _lock(descriptor: int, run_dir: str) -> None:
+    import fcntl
+
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise UserError(f"run_dir={run_dir}: another process is at work on this run; wait for it or end it") from error
+    except OSError:
+        pass  # a file system without locks
+
+
+def _unwritable(run_dir: str, error: OSError) -> UserError:
+    return UserError(f"run_dir={run_dir}: {error.strerror}; choose a folder that can be written")
+
+
+def _keep_lines(path: Path, count: int) -> None:
+    """Cut a text file back to its first ``count`` lines; a file without lines is removed."""
+    if not count:
+        path.unlink(missing_ok=True)
+        return
+    path.touch()
+    with path.open("r+b") as file:
+        if not all(file.readline().endswith(b"\n") for _ in range(count)):
+            raise UserError(f"{path}: what stood there before the checkpoint is missing; {ANEW}")
+        file.truncate(file.tell())
 
 
 def _finite(value: Any) -> Any:
@@ -116,4 +203,11 @@ def _remove_run(folder: RunFolder) -> None:
 
 def _files(folder: RunFolder) -> list[Path]:
     files = [folder.summary, folder.config, folder.metrics, folder.evaluations, folder.episodes]
-    return files + list(folder.checkpoints.glob("frames-*.pt"))
+    return files + list(folder.checkpoints.glob("frames-*.pt")) + _left_over(folder)
+
+
+def _left_over(folder: RunFolder) -> list[Path]:
+    """What a process that was killed while it wrote a file has left."""
+    names = [path.name for path in (folder.summary, folder.config)]
+    files = [folder.path / f".{name}.tmp" for name in names] + list(folder.checkpoints.glob(".frames-*.pt.tmp"))
+    return [path for path in files if path.exists()]
