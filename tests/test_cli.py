@@ -86,7 +86,7 @@ def test_a_sweep_runs_every_job_and_reports_each_that_fails(tmp_path):
     result = run(tmp_path, "-m", "seed=0,-1,1", *TINY)
 
     assert result.returncode == 2
-    assert "seed0 holds a finished run" in result.stderr
+    assert "seed0/config.yaml: missing or of another version; to begin anew, give overwrite=true" in result.stderr
     assert "seed=-1: a seed is" in result.stderr
     assert "Traceback" not in result.stderr
     assert (tmp_path / "outputs/basic/softgm/seed1/summary.json").exists()

@@ -1,13 +1,17 @@
-"""Train and evaluate: ``python -m softgm_bench algo=softgm task=wall seed=0``."""
+"""Train and evaluate: ``python -m softgm_bench algo=softgm task=wall seed=0``; with ``-m``, each cell of a grid."""
 
 import os
+import signal
 import sys
+from types import FrameType
+from typing import Any
 
 import hydra
 from hydra._internal.utils import get_args_parser
 from omegaconf import DictConfig
 
 from softgm_bench.config import UserError, config_directory, typed, validate
+from softgm_bench.experiment import sweep, sweep_cell
 from softgm_bench.experiment.explain import USER_ERRORS, explain
 
 
@@ -15,45 +19,80 @@ def main() -> int:
     """Run what the command line says; 0 when all went well, 2 after a user's error, 128 + signal when interrupted."""
     debugging = os.environ.get("HYDRA_FULL_ERROR") == "1"
     os.environ["HYDRA_FULL_ERROR"] = "1"  # let errors through instead of printing and leaving
-    failures = 0
-
-    def report(error: Exception) -> None:
-        nonlocal failures
-        failures += 1
-        if debugging:
-            raise error
-        print(f"softgm_bench: {explain(error, sys.argv[1:])}", file=sys.stderr)
-
-    def job(composed: DictConfig) -> None:  # a failing job of a sweep does not stop the others
-        try:
-            _train(composed)
-        except USER_ERRORS as error:
-            report(error)
-
     try:
-        _refuse_unknown_options()
-        hydra.main(version_base="1.3", config_path=str(config_directory()), config_name="config")(job)()
+        arguments = _arguments()
+        if arguments.multirun:
+            return _sweep(arguments)
+        _run()
     except USER_ERRORS as error:
-        report(error)
+        if debugging:
+            raise
+        print(f"softgm_bench: {explain(error, sys.argv[1:])}", file=sys.stderr)
+        return 2
     except KeyboardInterrupt as interruption:
         print(f"softgm_bench: {str(interruption) or 'interrupted; nothing was saved'}", file=sys.stderr)
         return getattr(interruption, "exit_code", 130)
-    return 2 if failures else 0
+    return 0
 
 
-def _train(composed: DictConfig) -> None:
-    config = typed(composed)
-    validate(config)
-    from softgm_bench.experiment.loop import train  # late: a refused command need not wait for torch
-
-    train(config)
+def _hydra(job: Any) -> None:
+    hydra.main(version_base="1.3", config_path=str(config_directory()), config_name="config")(job)()
 
 
-def _refuse_unknown_options() -> None:
-    _, unknown = get_args_parser().parse_known_args()
+def _run() -> None:
+    errors: list[Exception] = []
+
+    def job(composed: DictConfig) -> None:
+        try:
+            config = typed(composed)
+            validate(config)
+            from softgm_bench.experiment.loop import train  # late: a refused command need not wait for torch
+
+            train(config)
+        except USER_ERRORS as error:  # Hydra would print a line of its own
+            errors.append(error)
+
+    _hydra(job)
+    if errors:
+        raise errors[0]
+
+
+def _sweep(arguments: Any) -> int:
+    """Launch every cell; 2 if any failed, each of which is then listed."""
+    plan = sweep.plan(arguments.overrides, arguments.config_dir)
+    options = [argument for argument in sys.argv[1:] if argument not in arguments.overrides]
+    sys.argv[1:] = [*options, *plan.overrides]
+    received = 0
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        nonlocal received
+        received = number
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGTERM, interrupt)
+    try:
+        with sweep.reported(plan) as outcomes:
+            _hydra(sweep_cell.run)
+    except USER_ERRORS:
+        raise
+    except Exception as error:  # a launcher's, such as a worker of its own that was killed
+        line = str(error).strip().partition("\n")[0]
+        print(f"softgm_bench: the launcher stopped, {type(error).__name__}: {line}", file=sys.stderr)
+        print("softgm_bench: the same command goes on with what is not done", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt as interruption:
+        interruption.args = ("interrupted; the same command goes on with what is not done",)
+        interruption.exit_code = 128 + (received or signal.SIGINT)  # type: ignore[attr-defined]
+        raise
+    return 0 if outcomes.all_well else 2
+
+
+def _arguments() -> Any:
+    arguments, unknown = get_args_parser().parse_known_args()
     if unknown:
         name = unknown[0].lstrip("-").partition("=")[0]
         raise UserError(f"{unknown[0]}: no such option; settings are written without dashes: {name}=value")
+    return arguments
 
 
 if __name__ == "__main__":
