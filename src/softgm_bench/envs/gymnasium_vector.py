@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from omegaconf.errors import OmegaConfBaseException
 from tensordict import TensorDictBase
 
+from softgm_bench import plugins
 from softgm_bench.config import UserError, compose, dtype_of
 from softgm_bench.envs import keys, make_env
 from softgm_bench.envs.soft_arm import SoftArmEnv
@@ -50,6 +51,7 @@ def build_arm(
     Raises:
         ValueError, UserError: with one line that says what is wrong and what would be right.
     """
+    plugins.load()
     if task not in TASKS:
         raise ValueError(f"task is {task!r}: choose one of {', '.join(TASKS)}")
     for name, value in (("num_envs", num_envs), ("horizon", horizon)):
@@ -257,6 +259,7 @@ class SoftArmVectorEnv(VectorEnv[Array, Array, Array]):
 
 def register() -> None:
     """Make ``gymnasium.make`` and ``gymnasium.make_vec`` know ``SoftArm-<task>-v0`` for every task."""
+    plugins.load()
     for task in TASKS:
         gymnasium.register(
             f"SoftArm-{task}-v0",

@@ -73,7 +73,9 @@ def load(path: Path, device: str = "cpu", overrides: Sequence[str] = ()) -> Trai
         policy = trained.policy
         result = TrainedPolicy(policy, _on(run, device), state["frames"], state["versions"], run)
     except (KeyError, AttributeError, TypeError, RuntimeError, ValueError, *USER_ERRORS) as error:
-        raise UserError(f"{file}: this version cannot build its networks; use the version that trained it") from error
+        raise UserError(
+            f"{file}: this version cannot build its networks; use the version that trained it, with the same plugins"
+        ) from error
     if overrides:
         result.config = changed(plain(result.config), overrides)
         result.policy = _fitted(file, result, slots)

@@ -1,0 +1,206 @@
+"""What the commands do, from Python. ``overrides`` are settings as on the command line: ``"task=wall"``, ``"seed=1"``.
+
+Everything raises ``UserError`` with one line about what is wrong; Hydra and OmegaConf raise their own for settings that
+cannot be read. Loading this module takes seconds, for torch.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from softgm_bench import algorithms, plugins
+from softgm_bench.algorithms import Algorithm
+from softgm_bench.config import Config, compose
+from softgm_bench.envs import SoftArmEnv, keys
+from softgm_bench.envs.vmas import VmasEnv
+from softgm_bench.errors import UserError
+from softgm_bench.experiment import evaluation_folder, loop, policy, trajectory
+from softgm_bench.experiment.environment import build_env
+from softgm_bench.experiment.evaluation import DISCOUNT, EpisodeRecords, evaluate_in_parts
+from softgm_bench.experiment.policy import TrainedPolicy
+from softgm_bench.experiment.summary import summarise, table
+from softgm_bench.experiment.trajectory import Trajectory
+
+Source = str | Path | TrainedPolicy
+add_plugins = plugins.add
+
+
+@dataclass(frozen=True)
+class TrainedRun:
+    """A run that has finished.
+
+    Attributes:
+        folder: of its files.
+        summary: what ``summary.json`` holds.
+    """
+
+    folder: Path
+    summary: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Episodes that a policy has played.
+
+    Attributes:
+        records: one entry an episode.
+        metrics: mean and standard deviation of everything, the success rate with its interval; ``print`` shows them.
+    """
+
+    records: EpisodeRecords
+    metrics: dict[str, Any]
+
+    def __str__(self) -> str:
+        """A table."""
+        return table(self.metrics, f"{self.metrics['episodes']} episodes:")
+
+
+def configure(*overrides: str) -> Config:
+    """The checked settings that ``python -m softgm_bench <overrides>`` runs with."""
+    return compose(list(overrides))
+
+
+def make_env(*overrides: str, num_envs: int = 1, seed: int = 0, horizon: int | None = None) -> SoftArmEnv | VmasEnv:
+    """A TorchRL environment of ``num_envs`` arms, as evaluations use it.
+
+    Args:
+        overrides: settings, of which task, arm, perturbation, device, backend and precision count.
+        num_envs: simulated at once.
+        seed: of everything that the environments draw.
+        horizon: control steps of an episode; None: the task's own.
+    """
+    return build_env(configure(*overrides), num_envs, seed, horizon)
+
+
+def build_algorithm(config: Config, env: SoftArmEnv | VmasEnv) -> Algorithm:
+    """The algorithm that the settings mean, with fresh networks for ``env``: for a training loop of your own."""
+    try:
+        return algorithms.build_algorithm(config.algo, config.model, env, config.oracle)
+    except ValueError as error:
+        raise UserError(str(error)) from error
+
+
+def train(*overrides: str) -> TrainedRun:
+    """Train and evaluate, as ``python -m softgm_bench <overrides>`` does; Ctrl-C leaves a checkpoint."""
+    config = configure(*overrides)
+    return TrainedRun(Path(config.run_dir), loop.train(config))
+
+
+def load(source: str | Path, *overrides: str, device: str = "cpu") -> TrainedPolicy:
+    """The policy in a run folder (its newest checkpoint), a checkpoint or a policy's file.
+
+    Args:
+        source: of one of them.
+        overrides: settings to act in instead of the run's: a task, an arm, a perturbation, or single keys of them.
+        device: to act on.
+    """
+    return policy.load(Path(source), device, overrides)
+
+
+def act(
+    trained: TrainedPolicy | TensorDictModuleBase, observation: TensorDictBase, deterministic: bool = True
+) -> Tensor:
+    """Actions ``(num_envs, N, 2)`` in [-1, 1] for what ``env.reset()`` or ``step_mdp(env.step(...))`` gave."""
+    module = trained.policy if isinstance(trained, TrainedPolicy) else trained
+    with torch.no_grad(), set_exploration_type(_exploration(deterministic)):
+        return module(observation.select(*module.in_keys))[keys.ACTION]
+
+
+def rollout(
+    env: SoftArmEnv | VmasEnv,
+    trained: TrainedPolicy | TensorDictModuleBase | None = None,
+    steps: int = 100,
+    deterministic: bool = True,
+) -> TensorDictBase:
+    """``steps`` control steps from a reset on, ``(num_envs, steps)``; an arm whose episode ends begins another.
+
+    Args:
+        env: of ``make_env``.
+        trained: who acts; None: actions are uniform.
+        steps: control steps.
+        deterministic: act by the mode of the policy, otherwise by a sample.
+    """
+    module = trained.policy if isinstance(trained, TrainedPolicy) else trained
+    with torch.no_grad(), set_exploration_type(_exploration(deterministic)):
+        return env.rollout(steps, module, break_when_any_done=False)
+
+
+def evaluate(
+    source: Source,
+    *overrides: str,
+    episodes: int = 100,
+    seed: int = 0,
+    deterministic: bool = True,
+    horizon: int | None = None,
+    gamma: float = DISCOUNT,
+    batch: int | None = None,
+    out: str | Path | None = None,
+) -> Evaluation:
+    """Play ``episodes`` episodes that training has never seen, as ``python -m softgm_bench.evaluate`` does.
+
+    Args:
+        source: as ``load`` takes it, or what it gave.
+        overrides: settings to act in, as for ``load``.
+        episodes: one in each environment.
+        seed: of targets, obstacles and perturbations; the same gives the same episodes.
+        deterministic: act by the mode of the policy, otherwise by a sample.
+        horizon: control steps of an episode; None: the task's own.
+        gamma: of the discounted return.
+        batch: environments at once, to save memory; None: all. Others play other episodes.
+        out: folder for ``episodes.csv`` and ``summary.json``; None: nothing is written.
+    """
+    trained = _loaded(source, overrides)
+    if out is not None:
+        evaluation_folder.check(Path(out), overwrite=False)
+    records = evaluate_in_parts(
+        trained.policy,
+        lambda count, own: build_env(trained.config, count, own, horizon),
+        episodes,
+        deterministic=deterministic,
+        seed=seed,
+        gamma=gamma,
+        at_once=batch,
+    )
+    if out is not None:
+        settings = {
+            "evaluation_seed": seed,
+            "deterministic": deterministic,
+            "horizon": horizon or trained.config.task.horizon,
+            "batch": batch,
+            "discount": gamma,
+            "threads": torch.get_num_threads(),
+            "overrides": list(overrides),
+        }
+        evaluation_folder.write(Path(out), records, evaluation_folder.describe(trained, records, settings))
+    return Evaluation(records, summarise(records))
+
+
+def record(
+    source: Source,
+    *overrides: str,
+    seed: int = 0,
+    episode: int = 0,
+    horizon: int | None = None,
+    deterministic: bool = True,
+    attention: bool = False,
+) -> Trajectory:
+    """One episode of an evaluation as arrays, for ``trajectory.save`` and for drawing; see ``trajectory.record``."""
+    return trajectory.record(_loaded(source, overrides), seed, episode, horizon, deterministic, attention)
+
+
+def _loaded(source: Source, overrides: tuple[str, ...]) -> TrainedPolicy:
+    if not isinstance(source, TrainedPolicy):
+        return load(source, *overrides)
+    if overrides:
+        raise UserError(f"{overrides[0]}: the policy is loaded already; give its settings to load")
+    return source
+
+
+def _exploration(deterministic: bool) -> ExplorationType:
+    return ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
