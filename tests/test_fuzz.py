@@ -17,8 +17,25 @@ POLICY = (POLICIES / "basic_ippo.pt").read_bytes()
 in_one_file = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 KEYS = st.sampled_from(
-    "seed task task.n_agents task.horizon algo algo.gamma model.hidden experiment.num_envs rod.n_elements threads device "
-    "run_dir perturbation logger +new ~task algo.critic".split()
+    [
+        "seed",
+        "task",
+        "task.n_agents",
+        "task.horizon",
+        "algo",
+        "algo.gamma",
+        "model.hidden",
+        "experiment.num_envs",
+        "rod.n_elements",
+        "threads",
+        "device",
+        "run_dir",
+        "perturbation",
+        "logger",
+        "+new",
+        "~task",
+        "algo.critic",
+    ]
 )
 VALUES = st.one_of(
     st.text(max_size=12),
