@@ -10,7 +10,7 @@ import hydra
 from hydra._internal.utils import get_args_parser
 from omegaconf import DictConfig
 
-from softgm_bench.config import UserError, config_directory, typed, validate
+from softgm_bench.config import UserError, composing, config_directory, typed, validate
 from softgm_bench.experiment import sweep, sweep_cell
 from softgm_bench.experiment.explain import USER_ERRORS, explain
 
@@ -41,8 +41,11 @@ def _hydra(job: Any) -> None:
 
 def _run() -> None:
     errors: list[Exception] = []
+    began = False
 
     def job(composed: DictConfig) -> None:
+        nonlocal began
+        began = True
         try:
             config = typed(composed)
             validate(config)
@@ -52,7 +55,13 @@ def _run() -> None:
         except USER_ERRORS as error:  # Hydra would print a line of its own
             errors.append(error)
 
-    _hydra(job)
+    try:
+        _hydra(job)
+    except Exception as error:
+        if began:
+            raise
+        with composing():  # what is wrong is the settings
+            raise error
     if errors:
         raise errors[0]
 

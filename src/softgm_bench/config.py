@@ -6,7 +6,8 @@ it against the dataclasses, so a misspelt key or a wrong type is refused whereve
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any, get_origin, get_type_hints
@@ -134,8 +135,22 @@ def compose(overrides: list[str]) -> Config:
 
 def compose_untyped(overrides: list[str]) -> DictConfig:
     """What the YAML files and the overrides say, before it is held against the dataclasses."""
-    with initialize_config_dir(version_base="1.3", config_dir=str(config_directory())):
+    with initialize_config_dir(version_base="1.3", config_dir=str(config_directory())), composing():
         return hydra_compose("config", overrides)
+
+
+@contextmanager
+def composing() -> Iterator[None]:
+    """Around Hydra's composition, which refuses some settings, such as ``task=0``, with an error of Python's own.
+
+    Raises:
+        UserError: instead of it.
+    """
+    try:
+        yield
+    except (ValueError, TypeError, AttributeError, AssertionError) as error:
+        reason = next(iter(str(error).splitlines()), type(error).__name__)
+        raise UserError(f"the settings cannot be composed: {reason}; task, algo and the like take a name") from error
 
 
 def typed(composed: DictConfig) -> Config:

@@ -21,7 +21,7 @@ from hydra.core.override_parser.types import Override
 from hydra.core.plugins import Plugins
 from omegaconf import DictConfig
 
-from softgm_bench.config import UserError, available_threads, config_directory
+from softgm_bench.config import UserError, available_threads, composing, config_directory
 from softgm_bench.experiment import sweep_cell
 
 JOBLIB, LOCAL, SLURM, RAY = "joblib", "submitit_local", "submitit_slurm", "ray"
@@ -213,7 +213,7 @@ def _swept_threads(overrides: Sequence[str]) -> int | None:
 def _compose(overrides: Sequence[str], directory: str | None = None) -> DictConfig:
     """Configuration with Hydra's own part."""
     searched = [f"hydra.searchpath=[{_quoted('file://' + os.path.abspath(directory))}]"] if directory else []
-    with initialize_config_dir(version_base="1.3", config_dir=str(config_directory())):
+    with initialize_config_dir(version_base="1.3", config_dir=str(config_directory())), composing():
         return compose("config", [*overrides, *searched], return_hydra_config=True)
 
 
