@@ -37,11 +37,11 @@ class Curve:
 def curve(runs: Sequence[Run], measure: str) -> Curve | None:
     """The runs' evaluations put on common frames; None if any did not record the measure, or none is there.
 
-    Runs whose evaluations lie at the same frames keep them. Others are interpolated linearly at the union of their
-    frames within the range that all of them have.
+    A run that was never evaluated during training is left out. Runs whose evaluations lie at the same frames keep them.
+    Others are interpolated linearly at the union of their frames within the range that all of them have.
     """
-    points = [_points(run.progress, measure) for run in runs]
-    if not points or any(at is None or len(at[0]) == 0 for at in points):
+    points = [_points(run.progress, measure) for run in runs if run.progress]
+    if not points or any(at is None for at in points):
         return None
     known = [at for at in points if at is not None]
     first, last = max(frames[0] for frames, _ in known), min(frames[-1] for frames, _ in known)

@@ -1,8 +1,8 @@
 """Finds finished runs and evaluations below a folder, and says what else lies there and why it is not one.
 
-A run's folder holds ``config.yaml``, ``metrics.csv``, ``evaluations.jsonl``, ``episodes.csv`` and ``summary.json``, the
-last one only when it has finished. An evaluation's folder holds ``summary.json`` with a perturbation, and
-``episodes.csv``.
+A run's folder holds ``config.yaml``, ``metrics.csv``, ``episodes.csv`` and ``summary.json``, the last one only when it has
+finished, and ``evaluations.jsonl`` if it was evaluated before. An evaluation's folder holds ``summary.json`` with a
+perturbation, and ``episodes.csv``.
 """
 
 import csv
@@ -182,7 +182,8 @@ def _run(folder: RunFolder, name: str, summary: Mapping[str, Any], episodes: Col
         deterministic=summary["deterministic"],
         horizon=settings["final_horizon"] or horizon,
     )
-    lines = folder.evaluations.read_text().splitlines()
+    # a run that is shorter than the interval of its evaluations has no such file
+    lines = folder.evaluations.read_text().splitlines() if folder.evaluations.exists() else []
     progress = [json.loads(line) for line in lines]
     for entry in progress:
         if {"frames", "discounted_return", "episode_length"} - entry.keys():
