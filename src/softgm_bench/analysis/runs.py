@@ -1,7 +1,7 @@
 """Finds finished runs and evaluations below a folder, and says what else lies there and why it is not one.
 
-A run's folder holds ``config.yaml``, ``metrics.csv``, ``episodes.csv`` and ``summary.json``, the last one only when it has
-finished, and ``evaluations.jsonl`` if it was evaluated before. An evaluation's folder holds ``summary.json`` with a
+A run's folder holds ``config.yaml``, ``metrics.csv``, ``episodes.csv`` and ``summary.json``, the last one only when it
+has finished, and ``evaluations.jsonl`` if it was evaluated before. An evaluation's folder holds ``summary.json`` with a
 perturbation, and ``episodes.csv``.
 """
 
