@@ -5,7 +5,8 @@ import pytest
 from arms import STEPS, bending_arm
 from PIL import Image
 
-from softgm_bench.render.still import BESIDE_POSTS, BESIDE_THE_MOTION, Look, Studio, direction, png
+from softgm_bench.render.camera import BESIDE_POSTS, BESIDE_THE_MOTION
+from softgm_bench.render.still import Look, Studio, direction, png
 
 SMALL = {"width": 160, "height": 120}
 

@@ -17,7 +17,7 @@ from softgm_bench.envs.vmas import VmasConfig
 from softgm_bench.experiment import checkpoint
 from softgm_bench.experiment.environment import build_env
 from softgm_bench.experiment.explain import USER_ERRORS
-from softgm_bench.experiment.run_folder import RunFolder, write_atomically
+from softgm_bench.experiment.run_folder import RunFolder, write_where_asked
 
 
 @dataclass
@@ -99,11 +99,7 @@ def save(trained: TrainedPolicy, path: Path) -> None:
         },
         buffer,
     )
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, buffer.getvalue())
-    except OSError as error:
-        raise UserError(f"{path}: {error.strerror}; choose a file that can be written") from error
+    write_where_asked(path, buffer.getvalue())
 
 
 def _file(path: Path) -> Path:

@@ -121,6 +121,19 @@ def to_disk(folder: RunFolder) -> None:
             _fsync(path)
 
 
+def write_where_asked(path: Path, content: bytes) -> None:
+    """``write_atomically`` to a file that the user named, whose folder is made.
+
+    Raises:
+        UserError: it cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, content)
+    except OSError as error:
+        raise UserError(f"{path}: {error.strerror}; choose a file that can be written") from error
+
+
 def write_atomically(path: Path, content: bytes) -> None:
     """Write or replace a file so that, whatever happens, ``path`` holds all of the old content or all of the new."""
     temporary = path.with_name(f".{path.name}.tmp")

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softgm_bench.config import UserError
-from softgm_bench.experiment.run_folder import write_atomically
+from softgm_bench.experiment.run_folder import write_where_asked
 from softgm_bench.rod.actuation import control_points
 from softgm_bench.rod.parameters import RodParameters, rod_constants
 
@@ -142,11 +142,7 @@ def save(trajectory: Trajectory, path: Path) -> None:
     plain = {"format": FORMAT} | {name: getattr(trajectory, name) for name in PLAIN}
     buffer = io.BytesIO()
     np.savez_compressed(buffer, metadata=np.array(json.dumps(plain)), **arrays)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, buffer.getvalue())
-    except OSError as error:
-        raise UserError(f"{path}: {error.strerror}; choose a file that can be written") from error
+    write_where_asked(path, buffer.getvalue())
 
 
 def load(path: Path) -> Trajectory:

@@ -140,14 +140,10 @@ def _write(trajectory: "Trajectory", options: Options, file: Path) -> None:
         camera = default_camera(trajectory) | {name: value for name, value in chosen.items() if value is not None}
         write_html(trajectory, file, camera=camera)
         return
-    from softgm_bench.experiment.run_folder import write_atomically
+    from softgm_bench.experiment.run_folder import write_where_asked
 
     content = _draw(trajectory, options, file.suffix)
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(file, content)
-    except OSError as error:
-        raise UserError(f"{file}: {error.strerror}; choose a file that can be written") from error
+    write_where_asked(file, content)
 
 
 def _draw(trajectory: "Trajectory", options: Options, kind: str) -> bytes:

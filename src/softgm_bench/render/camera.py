@@ -1,14 +1,27 @@
 """A perspective camera, and one that shows given points as large as they fit."""
 
 from dataclasses import dataclass
-from math import cos, radians, sin, tan
+from math import atan2, cos, degrees, radians, sin, tan
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 FIELD_OF_VIEW = 28.0  # degrees, vertical: a long lens, so that near columns do not dwarf the arm
+# Azimuth and elevation, degrees. From behind a wall: what comes through it comes towards the camera.
+BEHIND_A_WALL = (-40.0, 20.0)
+BESIDE_POSTS = (-62.0, 22.0)
+BESIDE_THE_MOTION = (-65.0, 16.0)  # the first one from the target's direction
+MANY = 8  # cylinders that make up a wall
 NEAR = 0.05  # m in front of the camera, nothing nearer is looked at
+
+
+def default_direction(n_cylinders: int, target: Array) -> tuple[float, float]:
+    """Azimuth and elevation, degrees, from which a scene is looked at unless somebody says otherwise."""
+    if n_cylinders:
+        return BEHIND_A_WALL if n_cylinders >= MANY else BESIDE_POSTS
+    azimuth, elevation = BESIDE_THE_MOTION
+    return azimuth + degrees(atan2(target[1], target[0])), elevation
 
 
 @dataclass(frozen=True)

@@ -17,11 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softgm_bench.config import UserError
-from softgm_bench.experiment.run_folder import write_atomically
+from softgm_bench.experiment.run_folder import write_where_asked
 from softgm_bench.experiment.trajectory import Trajectory
 from softgm_bench.render import style
-from softgm_bench.render.camera import FIELD_OF_VIEW
+from softgm_bench.render.camera import FIELD_OF_VIEW, MANY, default_direction
 
 VIEWER = Path(__file__).with_name("viewer")
 SCRIPTS = (
@@ -38,11 +37,6 @@ SCRIPTS = (
     "matrix.js",
     "main.js",
 )
-# degrees, the default views of ``softgm_bench.render.still``, which needs more packages than this page
-BEHIND_A_WALL = (-40.0, 20.0)
-BESIDE_POSTS = (-62.0, 22.0)
-BESIDE_THE_MOTION = (-65.0, 16.0)  # the first one from the target's direction
-WALL = 8  # cylinders from which on they are one
 COLOURS = {
     "arm": style.ARM,
     "ring": style.RING,
@@ -81,11 +75,7 @@ def write_html(
         UserError: the file cannot be written.
     """
     text = render_page(trajectory, title=title, caption=caption, camera=camera)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, text.encode())
-    except OSError as error:
-        raise UserError(f"{path}: {error.strerror}; choose a file that can be written") from error
+    write_where_asked(path, text.encode())
 
 
 def render_page(
@@ -146,7 +136,7 @@ def payload(trajectory: Trajectory) -> dict[str, Any]:
         "diverged": bool(trajectory.diverged),
         "target": _numbers(trajectory.target),
         "cylinders": _cylinders(trajectory.cylinders),
-        "wall": len(trajectory.cylinders["length"]) >= WALL,
+        "wall": len(trajectory.cylinders["length"]) >= MANY,
         "slots": slots,
         "terms": list(trajectory.reward_terms),
         "colours": COLOURS,
@@ -157,10 +147,7 @@ def payload(trajectory: Trajectory) -> dict[str, Any]:
 
 def default_camera(trajectory: Trajectory) -> dict[str, float]:
     """Where the page looks from at first, as stills do; it moves so far away that the scene fits its window."""
-    count = len(trajectory.cylinders["length"])
-    azimuth, elevation = BEHIND_A_WALL if count >= WALL else BESIDE_POSTS if count else BESIDE_THE_MOTION
-    if not count:
-        azimuth += math.degrees(math.atan2(trajectory.target[1], trajectory.target[0]))
+    azimuth, elevation = default_direction(len(trajectory.cylinders["length"]), trajectory.target)
     return {"azimuth": round(azimuth, 3), "elevation": elevation, "fov": FIELD_OF_VIEW}
 
 

@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 
 from softgm_bench.experiment.trajectory import Trajectory
 from softgm_bench.render import style
+from softgm_bench.render.camera import MANY
 from softgm_bench.render.grid import make_grid
 from softgm_bench.render.shading import ARM, CYLINDER, MARK, OCCLUSION_REACH, OTHER, PENUMBRA, Drawing
 
 Array = NDArray[np.float64]
 
 SEEN_THROUGH = 0.34  # opacity of walls
-MANY = 8  # cylinders that make up a wall
 FRESH = 0.3  # s during which a discovered bin is shown as new
 TRACE = 240  # pieces of the tip's path
 FAINT = 0.005  # attention below this is not drawn

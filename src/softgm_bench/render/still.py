@@ -8,16 +8,12 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from softgm_bench.experiment.trajectory import Trajectory
-from softgm_bench.render.camera import fit
+from softgm_bench.render.camera import default_direction, fit
 from softgm_bench.render.raycast import render
-from softgm_bench.render.scene import MANY, Stage
+from softgm_bench.render.scene import Stage
 
 Picture = NDArray[np.uint8]
 
-# Azimuth and elevation, degrees. From behind a wall: what comes through it comes towards the camera.
-BEHIND_A_WALL = (-40.0, 20.0)
-BESIDE_POSTS = (-62.0, 22.0)
-BESIDE_THE_MOTION = (-65.0, 16.0)  # the first one from the target's direction
 INK, PALE, DONE = (74, 68, 72), (205, 196, 188), (56, 161, 105)
 
 
@@ -46,11 +42,7 @@ class Look:
 
 def direction(trajectory: Trajectory, look: Look) -> tuple[float, float]:
     """Azimuth and elevation of the camera, degrees."""
-    count = len(trajectory.cylinders["length"])
-    azimuth, elevation = BEHIND_A_WALL if count >= MANY else BESIDE_POSTS if count else BESIDE_THE_MOTION
-    if not count:
-        x, y, _ = trajectory.target
-        azimuth += float(np.degrees(np.arctan2(y, x)))
+    azimuth, elevation = default_direction(len(trajectory.cylinders["length"]), trajectory.target)
     return (
         azimuth if look.azimuth is None else look.azimuth,
         elevation if look.elevation is None else look.elevation,
