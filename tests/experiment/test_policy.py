@@ -58,7 +58,7 @@ def test_a_kept_policy_acts_as_the_runs_and_is_small(run, tmp_path):
 def test_the_policy_is_the_trained_one(run):
     trained = policy.load(run)
     state = checkpoint.load(checkpoint.latest(run / "checkpoints"))["algorithm"]["loss"]
-    values = [value for name, value in state.items() if name.startswith("actor_network_params.")]
+    values = [value for name, value in state.items() if name.startswith(("actor_network.", "actor_network_params."))]
     stored = sum(value.sum() for value in values if value.is_floating_point())
     torch.testing.assert_close(sum(value.sum() for value in trained.policy.parameters()).detach(), stored)
 

@@ -116,6 +116,14 @@ class Explorer(TensorDictModuleBase):
         return action
 
 
+class _SoftUpdate(SoftUpdate):
+    """TorchRL's, for all parameters in one call: one by one they take as long as their optimiser's step."""
+
+    def _step(self, p_source: TensorDictBase, p_target: TensorDictBase) -> None:
+        sources, targets = ([p.data for p in params.values(True, True)] for params in (p_source, p_target))
+        torch._foreach_lerp_(targets, sources, 1.0 - self.eps)
+
+
 class OffPolicy:
     """Stores frames, samples transitions, takes gradient steps; subclasses build networks and loss.
 
@@ -143,7 +151,7 @@ class OffPolicy:
         self.n_agents = env.n_agents
         loss.set_keys(reward=AGENT_REWARD, done=AGENT_DONE, terminated=AGENT_TERMINATED, priority=PRIORITY)
         loss.make_value_estimator(ValueEstimators.TD0, gamma=config.gamma)
-        self.target_update = SoftUpdate(loss, tau=config.tau)
+        self.target_update = _SoftUpdate(loss, tau=config.tau)
         self.optimizers: dict[str, torch.optim.Optimizer] = {}
         self.replay = _make_replay(config.replay_capacity, env, n_privileged)
         self.frames = 0

@@ -109,6 +109,8 @@ class PPO:
             entropy_coeff=config.entropy_coeff,
             critic_coeff=config.critic_coeff,
             loss_critic_type="l2",
+            log_explained_variance=False,
+            functional=False,  # there are no target networks, for which parameters would be swapped at every call
             normalize_advantage=False,  # done once an iteration, over all of its frames
         )
         self.loss.set_keys(action=keys.ACTION, sample_log_prob=keys.LOG_PROB, value=STATE_VALUE)
