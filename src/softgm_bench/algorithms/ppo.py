@@ -20,7 +20,8 @@ from softgm_bench.envs import SoftArmEnv, keys
 from softgm_bench.models.heads import STATE_VALUE, ActorConfig, ValueConfig, build_actor, build_value
 
 ADVANTAGE, VALUE_TARGET = "advantage", "value_target"
-REPORTED = ("loss_objective", "loss_critic", "loss_entropy", "entropy", "kl_approx", "clip_fraction")
+REPORTED = ("loss_objective", "loss_critic", "kl_approx", "clip_fraction")
+ENTROPY = ("loss_entropy", "entropy")  # reported too
 LR_MARGIN, LR_FACTOR = 1.5, 1.2  # of the actor's learning rate's adaptation to ``target_kl``
 LR_SCHEDULES = ("constant", "linear")
 
@@ -106,6 +107,7 @@ class PPO:
             self.policy,
             self.critic,
             clip_epsilon=config.clip_epsilon,
+            entropy_bonus=config.entropy_coeff > 0.0,
             entropy_coeff=config.entropy_coeff,
             critic_coeff=config.critic_coeff,
             loss_critic_type="l2",
@@ -136,20 +138,17 @@ class PPO:
 
         Returns:
             Means over all minibatches of losses, entropy, KL divergence, clip fraction and gradient norms; the learning
-            rates that the next update begins with.
+            rates that the next update begins with. Without an entropy bonus, entropy is that of the frames' actions.
         """
         frames = self.prepare(batch)
-        totals, counts = zip(*(self._epoch(frames) for _ in range(self.config.epochs)), strict=True)
-        names = list(totals[0])
         # the only look at results: a GPU works through all minibatches without being waited for
-        read = torch.stack([torch.stack([total[name] for name in names]) for total in totals]).tolist()
-        epochs = [
-            {name: value / count for name, value in zip(names, values, strict=True)}
-            for values, count in zip(read, counts, strict=True)
-        ]
+        read = torch.stack([self._epoch(frames) for _ in range(self.config.epochs)]).tolist()
+        epochs = [dict(zip(self._names, values, strict=True)) for values in read]
         self.trained_frames += batch.numel()
         self._set_learning_rates(epochs[-1]["kl_approx"])
-        means = {name: sum(epoch[name] for epoch in epochs) / len(epochs) for name in names}
+        means = {name: sum(epoch[name] for epoch in epochs) / len(epochs) for name in self._names}
+        if not self.loss.entropy_bonus:
+            means |= {"loss_entropy": 0.0, "entropy": -batch.get(keys.LOG_PROB).mean().item()}
         optimizers = {"actor_lr": self.actor_optimizer, "critic_lr": self.critic_optimizer}
         return means | {name: optimizer.param_groups[0]["lr"] for name, optimizer in optimizers.items()}
 
@@ -196,17 +195,18 @@ class PPO:
         value = self.critic(td.select(*self.critic.in_keys)).get(STATE_VALUE)
         return value if self.value_norm is None else self.value_norm.denormalize(value)
 
-    def _epoch(self, frames: TensorDictBase) -> tuple[dict[str, Tensor], int]:
-        """Pass once over all frames in random minibatches; sums over the minibatches, and how many there were."""
-        totals: dict[str, Tensor] = {}
-        count, size = 0, self.config.minibatch_size
-        for chosen in torch.randperm(len(frames), device=frames.device).split(size):
-            # a rest much smaller than a minibatch would weigh its few frames too much
-            if 2 * len(chosen) >= min(size, len(frames)):
-                for name, value in self._step(frames[chosen]).items():
-                    totals[name] = totals.get(name, torch.zeros_like(value)) + value
-                count += 1
-        return totals, count
+    @property
+    def _names(self) -> list[str]:
+        """Of the metrics of a gradient step."""
+        return [*REPORTED, *(ENTROPY if self.loss.entropy_bonus else ()), "actor_grad_norm", "critic_grad_norm"]
+
+    def _epoch(self, frames: TensorDictBase) -> Tensor:
+        """Pass once over all frames in random minibatches; means over the minibatches, in the order of ``_names``."""
+        size = self.config.minibatch_size
+        shuffled = frames[torch.randperm(len(frames), device=frames.device)]
+        # a rest much smaller than a minibatch would weigh its few frames too much
+        minibatches = [chosen for chosen in shuffled.split(size) if 2 * len(chosen) >= min(size, len(frames))]
+        return torch.stack([self._step(minibatch) for minibatch in minibatches]).mean(0)
 
     def _set_learning_rates(self, kl: float) -> None:
         """Learning rates of the next update: the settings, times what is left of a linear schedule's frames.
@@ -231,9 +231,10 @@ class PPO:
             for group in optimizer.param_groups:
                 group["lr"] = lr * left
 
-    def _step(self, minibatch: TensorDictBase) -> dict[str, Tensor]:
+    def _step(self, minibatch: TensorDictBase) -> Tensor:
+        """One gradient step of actor and critic; metrics in the order of ``_names``."""
         losses = self.loss(minibatch)
-        total = losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
+        total = sum(value for name, value in losses.items() if name.startswith("loss_"))
         self.actor_optimizer.zero_grad(set_to_none=True)
         self.critic_optimizer.zero_grad(set_to_none=True)
         total.backward()
@@ -242,8 +243,7 @@ class PPO:
         critic_norm = torch.nn.utils.clip_grad_norm_(self._critic_parameters, limit)
         self.actor_optimizer.step()
         self.critic_optimizer.step()
-        metrics = {name: losses[name].detach() for name in REPORTED}
-        return metrics | {"actor_grad_norm": actor_norm.detach(), "critic_grad_norm": critic_norm.detach()}
+        return torch.stack([*(losses[name].detach() for name in self._names[:-2]), actor_norm, critic_norm])
 
     def state_dict(self) -> dict[str, Any]:
         """Networks, optimisers, statistics of the value targets and where the schedules are."""
