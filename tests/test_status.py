@@ -93,6 +93,7 @@ def test_a_damaged_summary_is_a_failure(tmp_path):
 
 def test_the_table_has_a_line_a_run_and_counts_them(tmp_path):
     begun(tmp_path / "basic/mappo/seed0")
+    assert status.table(tmp_path, status._runs(tmp_path)).splitlines()[-1] == "1 run: 1 stopped"
     sweep_record.write_failure(tmp_path / "basic/mappo/seed1", "no space left")
     write_run(tmp_path, "basic", "mappo", 2)
     lines = status.table(tmp_path, status._runs(tmp_path)).splitlines()

@@ -51,7 +51,7 @@ def table(folder: Path, runs: Sequence[Path]) -> str:
     kinds = Counter(state.kind for state in states)
     order = (sweep_record.DONE, sweep_record.RUNNING, sweep_record.FAILED, sweep_record.STOPPED, sweep_record.MISSING)
     counts = ", ".join(f"{kinds[kind]} {kind}" for kind in order if kinds[kind])
-    return "\n".join([*lines, f"{len(runs)} runs{': ' + counts if counts else ''}"])
+    return "\n".join([*lines, f"{len(runs)} run{'s' * (len(runs) != 1)}{': ' + counts if counts else ''}"])
 
 
 def _runs(folder: Path) -> list[Path]:

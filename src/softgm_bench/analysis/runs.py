@@ -173,13 +173,8 @@ def _run(folder: RunFolder, name: str, summary: Mapping[str, Any], episodes: Col
         raise ValueError("config.yaml holds no settings")
     settings, horizon = config["experiment"]["evaluation"], config["task"]["horizon"]
     final = Evaluation(
-        folder=name,
-        task=summary["task"],
-        label=summary["algo"],
-        seed=summary["seed"],
-        frames=summary["frames"],
+        **_who_acted(name, summary),
         episodes=episodes,
-        deterministic=summary["deterministic"],
         horizon=settings["final_horizon"] or horizon,
     )
     # a run that is shorter than the interval of its evaluations has no such file
@@ -195,17 +190,18 @@ def _evaluation(name: str, summary: Mapping[str, Any], episodes: Columns) -> Eva
     _compare(episodes, summary["metrics"])
     perturbation = summary["perturbation"]
     return Evaluation(
-        folder=name,
-        task=summary["task"],
-        label=summary["algo"],
-        seed=summary["seed"],
-        frames=summary["frames"],
+        **_who_acted(name, summary),
         episodes=episodes,
-        deterministic=summary["deterministic"],
         horizon=summary.get("horizon") or _horizon(episodes),
         perturbation={"name": perturbation} if isinstance(perturbation, str) else perturbation,
         overrides=tuple(one for one in summary.get("overrides", ()) if not one.startswith("perturbation")),
     )
+
+
+def _who_acted(name: str, summary: Mapping[str, Any]) -> dict[str, Any]:
+    """What the summaries of a run and of an evaluation say alike."""
+    same = {field: summary[field] for field in ("task", "seed", "frames", "deterministic")}
+    return {"folder": name, "label": summary["algo"], **same}
 
 
 def _horizon(episodes: Columns) -> int | None:
