@@ -1,4 +1,5 @@
 import importlib.util
+import itertools
 from pathlib import Path
 
 import pytest
@@ -12,12 +13,28 @@ ROOT = Path(__file__).parents[1]
 POLICIES = sorted((ROOT / "experiments" / "policies").glob("*.pt"))
 
 
-@pytest.fixture(scope="module")
-def results():
-    specification = importlib.util.spec_from_file_location("results", ROOT / "experiments" / "results.py")
+def script(path):
+    specification = importlib.util.spec_from_file_location(path.stem, path)
     module = importlib.util.module_from_spec(specification)
     specification.loader.exec_module(module)
     return module
+
+
+@pytest.fixture(scope="module")
+def results():
+    return script(ROOT / "experiments" / "results.py")
+
+
+def test_the_comparison_with_benchmarl_is_whole_and_its_table_made_from_the_committed_runs(monkeypatch):
+    peers = ROOT / "benchmarks" / "peers"
+    monkeypatch.syspath_prepend(peers)
+    report = script(peers / "report.py")
+    curves, rates = report.read()
+    for framework, task, algo in itertools.product(report.FRAMEWORKS, report.TASKS, report.ALGORITHMS):
+        frames, returns = curves[framework, task, algo]
+        assert returns.shape == (3, len(frames))
+    text = report.PAGE.read_text()
+    assert report.page(text, report.table(curves, rates)) == text
 
 
 def test_the_tables_of_the_results_are_made_from_the_committed_runs(results):

@@ -1,7 +1,8 @@
-"""The figure and the table of what ``results/*.csv`` say; nothing is trained here."""
+"""The figure and the table of ``docs/peers.md``, from ``results/*.csv``; nothing is trained here."""
 
 import argparse
 import csv
+import re
 from collections import defaultdict
 from pathlib import Path
 
@@ -12,6 +13,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 from cells import ALGORITHMS, FRAMEWORKS, HERE, RESULTS, TASKS
 
+PAGE = HERE.parents[1] / "docs" / "peers.md"
+PICTURE = PAGE.with_suffix(".png")
 LABELS = {"benchmarl": "BenchMARL 1.5.2", "softgm_bench": "softgm_bench"}
 COLOURS = {"benchmarl": "#b35806", "softgm_bench": "#2166ac"}
 Curve = tuple[np.ndarray, np.ndarray]  # frames (points,), returns (seeds, points)
@@ -79,13 +82,23 @@ def table(curves: dict[tuple[str, str, str], Curve], rates: dict[tuple[str, str,
     return "\n".join(lines)
 
 
+def page(text: str, made: str) -> str:
+    """``docs/peers.md`` with another table between its two marks."""
+    text, count = re.subn(
+        r"<!-- table -->.*?<!-- end -->", lambda _: f"<!-- table -->\n\n{made}\n\n<!-- end -->", text, flags=re.DOTALL
+    )
+    if count != 1:
+        raise SystemExit(f"{PAGE}: one place for the table expected, found {count}")
+    return text
+
+
 def main() -> None:
     argparse.ArgumentParser(description=__doc__).parse_args()
     curves, rates = read()
-    figure(curves, HERE / "returns.png")
-    text = table(curves, rates)
-    (HERE / "table.md").write_text(text + "\n")
-    print(text)
+    figure(curves, PICTURE)
+    made = table(curves, rates)
+    PAGE.write_text(page(PAGE.read_text(), made))
+    print(made)
 
 
 if __name__ == "__main__":
