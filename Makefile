@@ -61,7 +61,7 @@ pictures: setup
 	$(BIN)/python experiments/pictures.py
 
 # Our algorithms and BenchMARL's on two VMAS tasks. BenchMARL needs an older TorchRL, so it has a virtual environment of
-# its own. Runs of which the results are there already are left out; all of them take an hour or two on a core.
+# its own. Runs of which the results are there already are left out; all of them take two hours on a core.
 PEERS := benchmarks/peers
 PEERS_STAMP := $(PEERS)/.venv/.setup
 THREADS ?= 1

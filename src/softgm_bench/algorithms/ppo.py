@@ -141,7 +141,7 @@ class PPO:
             rates that the next update begins with. Without an entropy bonus, entropy is that of the frames' actions.
         """
         frames = self.prepare(batch)
-        # the only look at results: a GPU works through all minibatches without being waited for
+        # results are first looked at here: a GPU works through all minibatches without being waited for
         read = torch.stack([self._epoch(frames) for _ in range(self.config.epochs)]).tolist()
         epochs = [dict(zip(self._names, values, strict=True)) for values in read]
         self.trained_frames += batch.numel()
