@@ -1,7 +1,7 @@
 """Run every cell whose results are missing, one after another. Seeds are the outermost loop: a part is of use too.
 
-A second one with the seeds the other way round, ``--seed 2 1 0``, shares the work: before a run each looks whether it is
-there already.
+A second one with the seeds the other way round, ``--seed 2 1 0``, shares the work: each looks again before it begins
+a run.
 """
 
 import argparse
