@@ -17,7 +17,7 @@ from timing import Stopwatch
 
 from softgm_bench.config import compose
 from softgm_bench.envs import SoftArmEnv, keys, make_env
-from softgm_bench.experiment.loop import set_threads
+from softgm_bench.runs.loop import set_threads
 
 TASKS = ("basic", "structured", "wall")
 SIZES = (1, 16, 64, 256, 1024)

@@ -19,10 +19,10 @@ from record import write
 
 from softgm_bench.config import compose
 from softgm_bench.envs import make_env
-from softgm_bench.experiment.loop import train
 from softgm_bench.rod.backend import make_backend
 from softgm_bench.rod.parameters import RodParameters
 from softgm_bench.rod.state import Cylinders, straight_rods
+from softgm_bench.runs.loop import train
 
 ARM = RodParameters()
 BATCHES = (64, 256, 1024, 4096, 16384)

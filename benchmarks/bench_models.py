@@ -24,9 +24,9 @@ from observations import observation
 
 from softgm_bench.config import compose
 from softgm_bench.envs import keys
-from softgm_bench.experiment.loop import keep_memory, set_threads
 from softgm_bench.models import build_encoder, graph
 from softgm_bench.models.softgm import SoftGMConfig
+from softgm_bench.runs.loop import keep_memory, set_threads
 
 N_AGENTS, N_SLOTS = 6, 128
 DISCOVERED = (0, 32, 128)

@@ -5,7 +5,7 @@ python examples/pettingzoo_random.py --task wall --episodes 3 --horizon 100
 
 import argparse
 
-from softgm_bench.envs.pettingzoo import parallel_env
+from softgm_bench.adapters.pettingzoo import parallel_env
 from softgm_bench.envs.tasks import TASKS
 
 

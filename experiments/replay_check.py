@@ -19,12 +19,12 @@ import numpy as np
 import torch
 from torchrl.envs import EnvBase
 
-from softgm_bench.experiment import policy, trajectory
-from softgm_bench.experiment.environment import build_env
-from softgm_bench.experiment.evaluation import evaluate_in_parts
-from softgm_bench.experiment.replay import compare, replay
-from softgm_bench.experiment.run_folder import to_json
-from softgm_bench.experiment.summary import versions
+from softgm_bench.assembly import build_env
+from softgm_bench.episodes import policy, trajectory
+from softgm_bench.episodes.evaluation import evaluate_in_parts
+from softgm_bench.episodes.replay import compare, replay
+from softgm_bench.episodes.summary import versions
+from softgm_bench.runs.folder import to_json
 
 ROOT = Path(__file__).parents[1]
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from softgm_bench.experiment.summary import wilson_interval
+from softgm_bench.episodes.summary import wilson_interval
 
 
 def episodes(generator: np.random.Generator, count: int, success: float, horizon: int = 2000) -> dict[str, np.ndarray]:

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-sys.path.insert(0, str(Path(__file__).parent / "experiment"))
+sys.path.insert(0, str(Path(__file__).parent / "episodes"))
 from recorded import SEEN, untrained, watched
 
 from softgm_bench import attention
-from softgm_bench.experiment import policy, trajectory
+from softgm_bench.episodes import policy, trajectory
 
 
 @pytest.fixture

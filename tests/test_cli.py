@@ -95,7 +95,7 @@ def test_a_sweep_runs_every_job_and_reports_each_that_fails(tmp_path):
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_an_interrupted_run_says_where_its_checkpoint_is(tmp_path, number, code):
-    from softgm_bench.experiment import checkpoint
+    from softgm_bench.runs import checkpoint
 
     endless = [*TINY, "experiment.total_frames=1_000_000", "experiment.checkpoint.interval=1_000_000"]
     process = subprocess.Popen(command(*endless), cwd=tmp_path, stderr=subprocess.PIPE, text=True)

@@ -7,7 +7,7 @@ import torch
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from softgm_bench.envs import keys, make_env
-from softgm_bench.experiment import policy
+from softgm_bench.episodes import policy
 
 ROOT = Path(__file__).parents[1]
 POLICIES = sorted((ROOT / "experiments" / "policies").glob("*.pt"))

@@ -13,8 +13,9 @@ import pytest
 import torch
 
 from softgm_bench import evaluate
-from softgm_bench.experiment import checkpoint, evaluation_folder
-from softgm_bench.experiment.evaluation import EpisodeRecords
+from softgm_bench.episodes import folder as evaluation_folder
+from softgm_bench.episodes.evaluation import EpisodeRecords
+from softgm_bench.runs import checkpoint
 
 POLICIES = Path(__file__).parents[1] / "experiments" / "policies"
 SOFTGM, MAPPO = str(POLICIES / "basic_softgm.pt"), str(POLICIES / "basic_mappo.pt")

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent / "experiment"))
+sys.path.insert(0, str(Path(__file__).parent / "episodes"))
 from recorded import WALL, recorded
 
 from softgm_bench import replay
-from softgm_bench.experiment import trajectory
+from softgm_bench.episodes import trajectory
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -11,7 +11,7 @@ import pytest
 from made_up_runs import write_run
 from softgm_bench import status
 from softgm_bench.config import UserError
-from softgm_bench.experiment import sweep_record
+from softgm_bench.sweeps import record as sweep_record
 
 HOLD = """
 import fcntl, os, sys

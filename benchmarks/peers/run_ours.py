@@ -10,7 +10,7 @@ import yaml
 from cells import HERE, Cell, asked_for, write
 
 from softgm_bench.config import compose
-from softgm_bench.experiment.loop import train
+from softgm_bench.runs.loop import train
 
 
 def overrides(cell: Cell, run_dir: str, threads: int) -> list[str]:

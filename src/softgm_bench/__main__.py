@@ -11,8 +11,9 @@ from hydra._internal.utils import get_args_parser
 from omegaconf import DictConfig
 
 from softgm_bench.config import UserError, composing, config_directory, typed, validate
-from softgm_bench.experiment import sweep, sweep_cell
-from softgm_bench.experiment.explain import USER_ERRORS, explain
+from softgm_bench.config.explain import USER_ERRORS, explain
+from softgm_bench.sweeps import cell as sweep_cell
+from softgm_bench.sweeps import launch as sweep
 
 
 def main() -> int:
@@ -49,7 +50,7 @@ def _run() -> None:
         try:
             config = typed(composed)
             validate(config)
-            from softgm_bench.experiment.loop import train  # late: a refused command need not wait for torch
+            from softgm_bench.runs.loop import train  # late: a refused command need not wait for torch
 
             train(config)
         except USER_ERRORS as error:  # Hydra would print a line of its own

@@ -16,16 +16,18 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from softgm_bench import algorithms, plugins
 from softgm_bench.algorithms import Algorithm
+from softgm_bench.assembly import build_env
 from softgm_bench.config import Config, compose
 from softgm_bench.envs import SoftArmEnv, keys
 from softgm_bench.envs.vmas import VmasEnv
+from softgm_bench.episodes import folder as evaluation_folder
+from softgm_bench.episodes import policy, trajectory
+from softgm_bench.episodes.evaluation import DISCOUNT, EpisodeRecords, evaluate_in_parts
+from softgm_bench.episodes.policy import TrainedPolicy
+from softgm_bench.episodes.summary import summarise, table
+from softgm_bench.episodes.trajectory import Trajectory
 from softgm_bench.errors import UserError
-from softgm_bench.experiment import evaluation_folder, loop, policy, trajectory
-from softgm_bench.experiment.environment import build_env
-from softgm_bench.experiment.evaluation import DISCOUNT, EpisodeRecords, evaluate_in_parts
-from softgm_bench.experiment.policy import TrainedPolicy
-from softgm_bench.experiment.summary import summarise, table
-from softgm_bench.experiment.trajectory import Trajectory
+from softgm_bench.runs import loop
 
 Source = str | Path | TrainedPolicy
 add_plugins = plugins.add

@@ -26,7 +26,7 @@ from softgm_bench import command
 from softgm_bench.config import UserError, available_threads
 
 if TYPE_CHECKING:
-    from softgm_bench.experiment.trajectory import Trajectory
+    from softgm_bench.episodes.trajectory import Trajectory
 
 RECORDING = ("seed", "episode", "episodes", "horizon", "deterministic", "threads")
 
@@ -71,7 +71,7 @@ def _attention(arguments: list[str]) -> None:
 
 
 def _episode(source: Path, options: Options, overrides: list[str]) -> "Trajectory":
-    from softgm_bench.experiment.trajectory import load, record  # late: a refused command is quick
+    from softgm_bench.episodes.trajectory import load, record  # late: a refused command is quick
 
     if source.suffix == ".npz":
         if overrides:
@@ -79,9 +79,9 @@ def _episode(source: Path, options: Options, overrides: list[str]) -> "Trajector
         return load(source)
     if options.threads is not None and not 1 <= options.threads <= available_threads():
         raise UserError(f"threads={options.threads}: choose 1 to {available_threads()}, the cores here, or null")
-    from softgm_bench.experiment import policy
-    from softgm_bench.experiment.loop import set_threads
-    from softgm_bench.experiment.recording import attention_encoder
+    from softgm_bench.episodes import policy
+    from softgm_bench.episodes.recording import attention_encoder
+    from softgm_bench.runs.loop import set_threads
 
     trained = policy.load(source, overrides=overrides)
     if attention_encoder(trained.policy) is None:
@@ -113,7 +113,7 @@ def _write(trajectory: "Trajectory", steps: list[int] | None, folder: Path) -> l
     import numpy as np
 
     from softgm_bench.analysis import attention
-    from softgm_bench.experiment.run_folder import write_atomically
+    from softgm_bench.runs.folder import write_atomically
 
     chosen = attention.busiest_steps(trajectory) if steps is None else steps
     for step in chosen:

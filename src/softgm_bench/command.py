@@ -13,7 +13,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from softgm_bench.config import CHANGEABLE, UserError
-from softgm_bench.experiment.explain import USER_ERRORS, explain
+from softgm_bench.config.explain import USER_ERRORS, explain
 
 Options = TypeVar("Options")
 

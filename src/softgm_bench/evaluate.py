@@ -77,11 +77,12 @@ def _evaluate(arguments: list[str]) -> None:
     )
     options.check()
     # late: a refused command need not wait for torch
-    from softgm_bench.experiment import evaluation_folder, policy
-    from softgm_bench.experiment.environment import build_env
-    from softgm_bench.experiment.evaluation import evaluate_in_parts
-    from softgm_bench.experiment.loop import keep_memory, set_threads
-    from softgm_bench.experiment.summary import table
+    from softgm_bench.assembly import build_env
+    from softgm_bench.episodes import folder as evaluation_folder
+    from softgm_bench.episodes import policy
+    from softgm_bench.episodes.evaluation import evaluate_in_parts
+    from softgm_bench.episodes.summary import table
+    from softgm_bench.runs.loop import keep_memory, set_threads
 
     trained = policy.load(source, options.device, overrides)
     unusual = {"horizon": options.horizon, "sampled": not options.deterministic}

@@ -13,7 +13,7 @@ def main() -> int:
     parser.add_argument("source", type=Path, help="run folder, whose newest checkpoint is taken, or checkpoint")
     parser.add_argument("file", type=Path, help="to be written or replaced")
     arguments = parser.parse_args()
-    from softgm_bench.experiment import policy  # late: help need not wait for torch
+    from softgm_bench.episodes import policy  # late: help need not wait for torch
 
     try:
         trained = policy.load(arguments.source)

@@ -16,8 +16,8 @@ from softgm_bench import command
 from softgm_bench.config import UserError
 
 if TYPE_CHECKING:
-    from softgm_bench.experiment.replay import Replay
-    from softgm_bench.experiment.trajectory import Trajectory
+    from softgm_bench.episodes.replay import Replay
+    from softgm_bench.episodes.trajectory import Trajectory
 
 ROWS = 10  # of the table of differences over time
 
@@ -38,12 +38,12 @@ def main() -> int:
 
 def _replay(arguments: list[str]) -> None:
     path, options, _ = command.parse(arguments, Options, "trajectory")
-    from softgm_bench.experiment import trajectory
+    from softgm_bench.episodes import trajectory
 
     if path.suffix != ".npz":
         raise UserError(f"{path}: name a recorded episode, a file that ends in .npz")
     recorded = trajectory.load(path)
-    from softgm_bench.experiment import replay  # late: a refused file need not wait for torch
+    from softgm_bench.episodes import replay  # late: a refused file need not wait for torch
 
     replayed = replay.replay(recorded, options.backend, options.pruning)
     result = replay.compare(recorded, replayed)
@@ -54,7 +54,7 @@ def _replay(arguments: list[str]) -> None:
 
 def report(recorded: "Trajectory", replayed: "Replay", result: dict[str, Any], options: Options) -> list[str]:
     """The comparison in lines for a reader."""
-    from softgm_bench.experiment.trajectory import describe
+    from softgm_bench.episodes.trajectory import describe
 
     seconds = recorded.rod.control_dt
     lines = [
@@ -83,7 +83,7 @@ def report(recorded: "Trajectory", replayed: "Replay", result: dict[str, Any], o
 
 
 def _write(path: Path, recorded: "Trajectory", replayed: "Replay", result: dict[str, Any], options: Options) -> None:
-    from softgm_bench.experiment.run_folder import to_json, write_atomically
+    from softgm_bench.runs.folder import to_json, write_atomically
 
     forces = None if replayed.contact_force is None else replayed.contact_force.tolist()
     about = {"info": recorded.info, "backend": options.backend, "pruning": options.pruning}

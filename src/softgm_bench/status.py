@@ -40,7 +40,7 @@ def _status(arguments: list[str]) -> None:
 
 def table(folder: Path, runs: Sequence[Path]) -> str:
     """A line for each run folder, and how many there are of each kind."""
-    from softgm_bench.experiment import sweep_record
+    from softgm_bench.sweeps import record as sweep_record
 
     states = [sweep_record.state(run) for run in runs]
     names = [os.path.relpath(run, folder) for run in runs]
@@ -67,7 +67,7 @@ def _runs(folder: Path) -> list[Path]:
 
 def _cells(folder: Path, grid: str) -> list[Path]:
     """Run folders of a grid that was launched into ``folder``."""
-    from softgm_bench.experiment import sweep
+    from softgm_bench.sweeps import launch as sweep
 
     known = sorted(path.stem for path in (config_directory() / "experiments").glob("*.yaml"))
     if grid not in known:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "experiment"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "episodes"))
 from recorded import SEEN, watched
 
 from softgm_bench.analysis import attention

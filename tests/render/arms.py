@@ -3,7 +3,7 @@
 import numpy as np
 
 from softgm_bench.config import compose, plain
-from softgm_bench.experiment.trajectory import Trajectory
+from softgm_bench.episodes.trajectory import Trajectory
 
 STEPS, N, M = 6, 6, 4  # control steps, agents, slots
 POST_X, POST_RADIUS = 0.35, 0.05

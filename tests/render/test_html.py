@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from softgm_bench.config import UserError, compose, plain
-from softgm_bench.experiment.trajectory import Trajectory
+from softgm_bench.episodes.trajectory import Trajectory
 from softgm_bench.render.html import ATTENTION_BYTES, SCRIPTS, VIEWER, payload, render_page, write_html
 from softgm_bench.rod.parameters import RodParameters
 

@@ -7,7 +7,7 @@ from arms import bending_arm
 from PIL import Image
 
 from softgm_bench import command
-from softgm_bench.experiment import trajectory
+from softgm_bench.episodes import trajectory
 from softgm_bench.render import __main__ as render
 
 POLICY = Path(__file__).parents[2] / "experiments" / "policies" / "basic_softgm.pt"

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure as Canvas
 from numpy.typing import NDArray
 
 from softgm_bench.analysis.style import GRID, INK, PAPER, SOFT, look
-from softgm_bench.experiment.trajectory import Trajectory, describe
+from softgm_bench.episodes.trajectory import Trajectory, describe
 
 COLOURS = "magma_r"  # perceptually uniform; zero is the pale end
 NO_EDGE = "#f3f1eb"

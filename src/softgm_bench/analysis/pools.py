@@ -82,7 +82,7 @@ class Pool:
 
 def wilson(evaluation: Evaluation) -> tuple[float, float]:
     """95 % interval of one policy's success rate over its episodes."""
-    from softgm_bench.experiment.summary import wilson_interval  # brings torch along
+    from softgm_bench.episodes.summary import wilson_interval  # brings torch along
 
     success = evaluation.episodes["success"]
     return wilson_interval(int(success.sum()), len(success))

@@ -29,7 +29,7 @@ from softgm_bench import command
 from softgm_bench.config import UserError
 
 if TYPE_CHECKING:
-    from softgm_bench.experiment.trajectory import Trajectory
+    from softgm_bench.episodes.trajectory import Trajectory
 
 KINDS = (".png", ".mp4", ".webp", ".gif", ".html")
 LARGEST = 4096  # pixels
@@ -71,8 +71,8 @@ def main(arguments: list[str]) -> None:
     )
     files = _files(options)
     _check(options, files)
-    from softgm_bench.experiment import trajectory as episodes  # late: what is refused should not wait
-    from softgm_bench.experiment.loop import set_threads
+    from softgm_bench.episodes import trajectory as episodes  # late: what is refused should not wait
+    from softgm_bench.runs.loop import set_threads
 
     set_threads(options.threads)  # as an evaluation does: rounding depends on it
     if source.suffix == ".npz":
@@ -140,7 +140,7 @@ def _write(trajectory: "Trajectory", options: Options, file: Path) -> None:
         camera = default_camera(trajectory) | {name: value for name, value in chosen.items() if value is not None}
         write_html(trajectory, file, camera=camera)
         return
-    from softgm_bench.experiment.run_folder import write_where_asked
+    from softgm_bench.runs.folder import write_where_asked
 
     content = _draw(trajectory, options, file.suffix)
     write_where_asked(file, content)

@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softgm_bench.experiment.run_folder import write_where_asked
-from softgm_bench.experiment.trajectory import Trajectory
+from softgm_bench.episodes.trajectory import Trajectory
 from softgm_bench.render import style
 from softgm_bench.render.camera import FIELD_OF_VIEW, MANY, default_direction
+from softgm_bench.runs.folder import write_where_asked
 
 VIEWER = Path(__file__).with_name("viewer")
 SCRIPTS = (

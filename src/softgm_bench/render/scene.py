@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from softgm_bench.experiment.trajectory import Trajectory
+from softgm_bench.episodes.trajectory import Trajectory
 from softgm_bench.render import style
 from softgm_bench.render.camera import MANY
 from softgm_bench.render.grid import make_grid

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from softgm_bench.experiment.trajectory import Trajectory
+from softgm_bench.episodes.trajectory import Trajectory
 from softgm_bench.render.camera import default_direction, fit
 from softgm_bench.render.raycast import render
 from softgm_bench.render.scene import Stage

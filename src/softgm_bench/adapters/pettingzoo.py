@@ -1,0 +1,299 @@
+"""The arm as a PettingZoo environment: one agent per section, one environment. PettingZoo is an optional extra."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from typing import Any, TypeAlias
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import Bounded
+
+from softgm_bench.envs import keys
+from softgm_bench.envs.soft_arm import SoftArmEnv
+from softgm_bench.envs.specs import DIRECTIONS
+from softgm_bench.envs.views import flat_features, flat_observation
+
+try:
+    import gymnasium
+    from gymnasium import spaces
+    from pettingzoo import ParallelEnv
+
+    from softgm_bench.adapters.gymnasium_vector import (
+        build_arm,
+        checked_action,
+        checked_seed,
+        info_columns,
+        info_row,
+        joint_size,
+        joint_view,
+        put_action,
+        real_space,
+    )
+except ImportError as error:
+    raise ImportError("PettingZoo is not installed: pip install 'softgm-bench[pettingzoo]'") from error
+
+Array = NDArray[Any]
+Observation = Array | dict[str, Array]
+RENDER_MODES = ("rgb_array",)
+WIDTH, HEIGHT = 640, 480  # of pictures, pixels
+VIEW_DISTANCE = 5.0  # of the camera, in lengths of the arm: in the picture unless it hangs straight down
+
+
+def parallel_env(
+    task: str = "wall",
+    seed: int | None = None,
+    render_mode: str | None = None,
+    horizon: int | None = None,
+    overrides: Sequence[str] = (),
+    observation: str = "flat",
+) -> "SoftArmParallelEnv":
+    """Build one arm with settings from ``conf/``.
+
+    Args:
+        task: ``basic``, ``structured``, ``wall``, ``wall_narrow`` or ``wall_fixed``.
+        seed: of the scenes until ``reset(seed=...)`` gives another; None: from the operating system.
+        render_mode: ``rgb_array`` or None.
+        horizon: control steps until truncation, the task's by default.
+        overrides: settings as on the command line, e.g. ``["task.n_agents=4", "perturbation=noise"]``.
+        observation: ``flat``, one vector for an MLP, or ``dict``, the same content by name.
+
+    Raises:
+        ValueError, UserError: with one line that says what is wrong and what would be right.
+    """
+    if observation not in _VIEWS:
+        raise ValueError(f"observation is {observation!r}: choose one of {', '.join(_VIEWS)}")
+    if render_mode is not None and render_mode not in RENDER_MODES:
+        raise ValueError(f"render_mode is {render_mode!r}: choose {', '.join(RENDER_MODES)} or None")
+    return SoftArmParallelEnv(build_arm(task, 1, seed, horizon, overrides), observation, render_mode)
+
+
+class _Film:
+    """An episode until now, for the renderer: it draws the tip's path and when obstacles were discovered."""
+
+    def __init__(self, arm: SoftArmEnv) -> None:
+        self._arm = arm
+        self._states: dict[str, list[Array]] = {}
+        self._steps: dict[str, list[Array]] = {}
+        self._camera: Any = None  # of the episode: what stands still shall do so in the pictures
+        self._td: TensorDictBase | None = None
+
+    def begin(self, td: TensorDictBase) -> None:
+        """Forget everything and note the state after a reset."""
+        self._states, self._camera, self._td = {}, None, td
+        self._steps = {"action": [], "tip_force": [], "reward": []}
+        self._note_state(td)
+
+    def step(self, td: TensorDictBase) -> None:
+        """Note what a step led to."""
+        force = self._arm.tip_force
+        self._steps["action"].append(_first_row(self._arm.applied_action))
+        self._steps["tip_force"].append(np.zeros(3) if force is None else _first_row(force).astype(np.float64))
+        self._steps["reward"].append(_first_row(td[keys.REWARD])[0])
+        self._td = td
+        self._note_state(td)
+
+    def picture(self) -> Array:
+        """The last state, ``(height, width, 3)`` uint8."""
+        try:
+            from softgm_bench.render.still import Look, Studio
+        except ImportError as error:
+            raise ImportError("rendering is not installed: pip install 'softgm-bench[render]'") from error
+        trajectory = self._trajectory()
+        studio = Studio(
+            trajectory, Look(WIDTH, HEIGHT, distance=VIEW_DISTANCE * self._arm.backend.parameters.base_length)
+        )
+        if self._camera is None:
+            self._camera = studio.camera
+        studio.camera = self._camera
+        return studio.picture(trajectory.steps)
+
+    def _note_state(self, td: TensorDictBase) -> None:
+        rod = self._arm.rod
+        now = {name: getattr(rod, name) for name in ("position", "director", "velocity", "omega")}
+        now |= {"contact": self._arm.contacts()}
+        now |= {"slots/active": td[keys.SLOT_ACTIVE], "slots/descriptor": td[keys.SLOT_DESCRIPTOR]}
+        for name, values in now.items():
+            self._states.setdefault(name, []).append(_first_row(values))
+
+    def _trajectory(self) -> Any:
+        from softgm_bench.episodes.trajectory import CYLINDER_FIELDS, Trajectory
+
+        assert self._td is not None
+        arm, cylinders = self._arm, self._arm.scene.cylinders
+        exists = _first_row(cylinders.mask)
+        states = {name: np.stack(values) for name, values in self._states.items()}
+        steps = len(self._steps["reward"])
+        shapes = {"action": (steps, arm.n_agents, DIRECTIONS), "tip_force": (steps, 3), "reward": (steps,)}
+        return Trajectory(
+            observation={name: states.pop(name) for name in tuple(states) if "/" in name},
+            **states,
+            **{name: np.array(values).reshape(shapes[name]) for name, values in self._steps.items()},
+            target=_first_row(arm.scene.target).astype(np.float64),
+            reward_terms={},
+            cylinders={name: _first_row(getattr(cylinders, name))[exists].astype(float) for name in CYLINDER_FIELDS},
+            attention={},
+            success=bool(self._td[keys.SUCCESS]),
+            diverged=bool(self._td[keys.DIVERGED]),
+            config={"rod": asdict(arm.backend.parameters), "task": asdict(arm.task.config)},
+            info={},
+        )
+
+
+def _first_row(values: Tensor) -> Array:
+    """Of the only environment, an array of its own."""
+    return values[0].cpu().numpy().copy()
+
+
+class SoftArmParallelEnv(ParallelEnv[str, Observation, Array]):
+    """A ``SoftArmEnv`` of one environment, whose steps it repeats bit by bit.
+
+    Agents are ``section_0``, nearest to the base, to ``section_<N - 1>``. All receive the team's reward, end together,
+    and are gone then until ``reset``. ``step`` needs an action of every agent; what lies outside of [-1, 1] is clipped.
+    """
+
+    def __init__(self, arm: SoftArmEnv, observation: str, render_mode: str | None) -> None:
+        """Wrap an environment with ``num_envs`` 1; use ``parallel_env``."""
+        self.arm = arm
+        self.render_mode = render_mode
+        self.metadata = {
+            "name": "soft_arm_v0",
+            "render_modes": list(RENDER_MODES),
+            "render_fps": 1.0 / arm.backend.parameters.control_dt,
+            "is_parallelizable": True,
+        }
+        self.possible_agents = [f"section_{index}" for index in range(arm.n_agents)]
+        self.agents: list[str] = []
+        space, self._observe = _VIEWS[observation]
+        self.observation_spaces = {agent: space(arm) for agent in self.possible_agents}
+        self.action_spaces = {agent: spaces.Box(-1.0, 1.0, (DIRECTIONS,), np.float32) for agent in self.possible_agents}
+        self.state_space = real_space(joint_size(arm))
+        self._film = None if render_mode is None else _Film(arm)
+        self._td: TensorDictBase | None = None
+
+    def observation_space(self, agent: str) -> spaces.Space:
+        """Of one agent; the same object each time, so that it can be seeded."""
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> spaces.Box:
+        """(normal, binormal) in [-1, 1]; the same object each time."""
+        return self.action_spaces[agent]
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Observation], dict[str, dict[str, Any]]]:
+        """Begin an episode; with a seed, the same one each time. There are no options."""
+        if seed is not None:
+            self.arm.set_seed(checked_seed(seed))
+        self._td = self.arm.reset()
+        self.agents = list(self.possible_agents)
+        if self._film is not None:
+            self._film.begin(self._td)
+        return self._observations(), self._infos()
+
+    def step(
+        self, actions: Mapping[str, Array]
+    ) -> tuple[dict[str, Observation], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
+        """One control step.
+
+        Raises:
+            ValueError: there is no episode under way, or the actions are not one finite ``(2,)`` for each agent.
+        """
+        if self._td is None or not self.agents:
+            raise ValueError("step outside of an episode: call reset()")
+        if set(actions) != set(self.agents):
+            raise ValueError(f"actions are of {', '.join(map(str, actions))}: they must be of {', '.join(self.agents)}")
+        joint = np.stack([checked_action(actions[agent], (DIRECTIONS,)) for agent in self.agents])
+        self._td = td = self.arm.step(put_action(self._td, joint, self.arm))["next"]
+        if self._film is not None:
+            self._film.step(td)
+        reward, terminated, truncated = (td[key].item() for key in (keys.REWARD, keys.TERMINATED, keys.TRUNCATED))
+        if terminated or truncated:
+            self.agents = []
+        every = self.possible_agents
+        return (
+            self._observations(),
+            dict.fromkeys(every, reward),
+            dict.fromkeys(every, terminated),
+            dict.fromkeys(every, truncated),
+            self._infos(),
+        )
+
+    def state(self) -> Array:
+        """For centralised critics: the entries of ``keys.OBSERVATION`` one after another, float32."""
+        return joint_view(self._frame())[0]
+
+    def render(self) -> Array | None:
+        """The arm as it stands, ``(height, width, 3)`` uint8."""
+        if self.render_mode is None:
+            gymnasium.logger.warn("render() without a render_mode: build the environment with render_mode='rgb_array'")
+            return None
+        assert self._film is not None
+        self._frame()
+        return self._film.picture()
+
+    def close(self) -> None:
+        """Nothing is held that would have to be released."""
+        self.arm.close()
+
+    def _frame(self) -> TensorDictBase:
+        if self._td is None:
+            raise ValueError("there is nothing to see before the first reset: call reset()")
+        return self._td
+
+    def _observations(self) -> dict[str, Observation]:
+        return dict(zip(self.possible_agents, self._observe(self._frame()), strict=True))
+
+    def _infos(self) -> dict[str, dict[str, Any]]:
+        columns = info_columns(self._frame())
+        return {agent: info_row(columns, 0) for agent in self.possible_agents}
+
+
+def _flat_space(arm: SoftArmEnv) -> spaces.Box:
+    return real_space(flat_features(arm.n_slots))
+
+
+def _flat_rows(td: TensorDictBase) -> list[Observation]:
+    return list(flat_observation(td)[0].cpu().numpy())
+
+
+def _dict_space(arm: SoftArmEnv) -> spaces.Dict:
+    """Spaces of ``_dict_rows``; those of slots are absent where a task has none."""
+    acted = arm.observation_spec[keys.PREVIOUS_ACTION]
+    bounded = isinstance(acted, Bounded)  # noise goes beyond
+    entries: dict[str, spaces.Space] = {
+        "position": real_space(3),
+        "velocity": real_space(3),
+        "previous_action": spaces.Box(-1.0, 1.0, (DIRECTIONS,), np.float32) if bounded else real_space(DIRECTIONS),
+        "tip": real_space(3),
+        "target": real_space(3),
+    }
+    if arm.n_slots:
+        entries["slot_descriptor"] = real_space(*arm.observation_spec[keys.SLOT_DESCRIPTOR].shape[1:])
+        entries["slot_active"] = spaces.MultiBinary(arm.n_slots)
+        entries["edge"] = spaces.MultiBinary(arm.n_slots)
+    return spaces.Dict(entries)
+
+
+def _dict_rows(td: TensorDictBase) -> list[Observation]:
+    """The entries of ``keys.OBSERVATION``, of the agents' own each agent's row; arrays that nothing else refers to."""
+    own = {"position": keys.AGENT_POSITION, "velocity": keys.AGENT_VELOCITY, "previous_action": keys.PREVIOUS_ACTION}
+    shared: dict[str, Any] = {"tip": keys.TIP, "target": keys.TARGET}
+    if td[keys.SLOT_ACTIVE].shape[-1]:
+        own |= {"edge": keys.EDGE}
+        shared |= {"slot_descriptor": keys.SLOT_DESCRIPTOR, "slot_active": keys.SLOT_ACTIVE}
+
+    def array(value: Tensor) -> Array:
+        return np.array(value.cpu().numpy(), dtype=np.int8 if value.dtype == torch.bool else np.float32)
+
+    return [
+        {name: array(td[key][0, agent]) for name, key in own.items()}
+        | {name: array(td[key][0]) for name, key in shared.items()}
+        for agent in range(td[keys.EDGE].shape[-2])
+    ]
+
+
+_View: TypeAlias = tuple[Callable[[SoftArmEnv], spaces.Space], Callable[[TensorDictBase], list[Observation]]]
+_VIEWS: dict[str, _View] = {"flat": (_flat_space, _flat_rows), "dict": (_dict_space, _dict_rows)}

@@ -1,0 +1,164 @@
+"""A recorded episode once more: its actions and forces, against its cylinders, by any implementation of the rod."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from softgm_bench.config import UserError
+from softgm_bench.episodes.trajectory import ROD, Array, Trajectory
+from softgm_bench.rod.actuation import Actuation
+from softgm_bench.rod.backend import make_backend
+from softgm_bench.rod.divergence import diverged
+from softgm_bench.rod.parameters import rod_constants
+from softgm_bench.rod.state import Cylinders, RodState
+
+BACKENDS = ("numba", "torch", "pyelastica")
+
+
+@dataclass(frozen=True)
+class Replay:
+    """States as in ``Trajectory``; from PyElastica also what its cylinders did, otherwise None.
+
+    Attributes:
+        position: m, ``(T + 1, 3, n_nodes)``.
+        director: ``(T + 1, 3, 3, n_elements)``.
+        velocity: m/s, ``(T + 1, 3, n_nodes)``.
+        omega: rad/s, ``(T + 1, 3, n_elements)``.
+        contact_force: the largest force of the cylinders on any node within each step, N, ``(T,)``.
+        missed: contacts (cylinder and substep) that PyElastica's bounding boxes did not, or would not, let through.
+    """
+
+    position: Array
+    director: Array
+    velocity: Array
+    omega: Array
+    contact_force: Array | None = None
+    missed: int | None = None
+
+
+def replay(trajectory: Trajectory, backend: str, pruning: bool = False) -> Replay:
+    """Simulate a trajectory's actions and forces from its first state.
+
+    Args:
+        trajectory: what was recorded.
+        backend: one of ``BACKENDS``. PyElastica computes in float64, the others in the recording's type.
+        pruning: PyElastica skips cylinders by its bounding boxes as it is shipped, which may miss contacts.
+
+    Raises:
+        UserError: no such backend, one that cannot simulate this arm, or PyElastica is not installed.
+    """
+    if backend not in BACKENDS:
+        raise UserError(f"backend={backend}: choose one of {', '.join(BACKENDS)}")
+    if pruning and backend != "pyelastica":
+        raise UserError(f"pruning=true: only backend=pyelastica has bounding boxes, not backend={backend}")
+    return _pyelastica(trajectory, pruning) if backend == "pyelastica" else _ours(trajectory, backend)
+
+
+def compare(trajectory: Trajectory, replayed: Replay) -> dict[str, Any]:
+    """How far a replay is from the recording.
+
+    Returns:
+        ``identical``: whether all bits are equal. ``largest``: the largest difference of a component over the episode,
+        by quantity. ``position``: that of nodes at each state, m, ``T + 1`` numbers. ``recorded`` and ``replayed``: the
+        tip's ``final_distance`` to the target, m, and ``reached``, the first step after which it is within the task's
+        radius, None if there is none.
+    """
+    differences = {name: np.abs(getattr(replayed, name) - getattr(trajectory, name)) for name in ROD}
+    sides: dict[str, Trajectory | Replay] = {"recorded": trajectory, "replayed": replayed}
+    radius = trajectory.config["task"]["success_radius"]
+    return {
+        "identical": all(np.array_equal(getattr(replayed, name), getattr(trajectory, name)) for name in ROD),
+        "largest": {name: float(values.max()) for name, values in differences.items()},
+        "position": differences["position"].max(axis=(1, 2)).tolist(),
+        **{name: _outcome(side.position, trajectory.target, radius) for name, side in sides.items()},
+    }
+
+
+def _outcome(position: Array, target: Array, radius: float) -> dict[str, Any]:
+    distance = np.linalg.norm(position[1:, :, -1] - target, axis=1)
+    reached = np.flatnonzero(distance < radius)
+    return {"final_distance": float(distance[-1]), "reached": int(reached[0]) + 1 if len(reached) else None}
+
+
+def _ours(trajectory: Trajectory, name: str) -> Replay:
+    parameters, dtype = trajectory.rod, torch.from_numpy(trajectory.position).dtype
+    backend, couple, force = make_backend(name, parameters), _couple(trajectory, dtype), _force(trajectory)
+    cylinders = _cylinders(trajectory, dtype)
+    task = trajectory.config["task"]
+    rest_length = torch.as_tensor(rod_constants(parameters).rest_length, dtype=dtype)
+    state = RodState(**{name: _first(trajectory, name) for name in ROD}, batch_size=[1])
+    states = [state]
+    for step in range(trajectory.steps):
+        push = None if force is None else torch.from_numpy(force(step)).to(dtype).unsqueeze(0)
+        moved = backend.control_step(state, couple(step), force=push, cylinders=cylinders)
+        # the environment keeps the last state of an arm whose simulation breaks
+        broken = diverged(moved, rest_length, task["min_dilatation"], task["max_dilatation"])
+        state = state if bool(broken.any()) else moved
+        states.append(state)
+    arrays: dict[str, Any] = {name: np.concatenate([getattr(state, name).numpy() for state in states]) for name in ROD}
+    return Replay(**arrays)
+
+
+def _pyelastica(trajectory: Trajectory, pruning: bool) -> Replay:
+    try:
+        from softgm_bench.rod.pyelastica_oracle import Post, simulate
+    except ImportError as error:
+        raise UserError("backend=pyelastica needs PyElastica: pip install 'softgm-bench[pyelastica]'") from error
+    parameters = trajectory.rod
+    if parameters.contact_model != "pyelastica" and len(trajectory.cylinders["start"]):
+        raise UserError(f"rod.contact_model={parameters.contact_model}: PyElastica has no such contact")
+    if trajectory.diverged:
+        raise UserError("backend=pyelastica: this episode's simulation broke in its last step, which has no state")
+    couple = _couple(trajectory, torch.float64)
+    columns = (trajectory.cylinders[name].tolist() for name in Post._fields)
+    posts = [Post(*row) for row in zip(*columns, strict=True)]
+    history = simulate(
+        parameters, lambda step: couple(step)[0].numpy(), trajectory.steps, posts, _force(trajectory), pruning
+    )
+    states: dict[str, Any] = {
+        name: np.concatenate([getattr(trajectory, name)[:1].astype(np.float64), getattr(history, name)]) for name in ROD
+    }
+    return Replay(**states, contact_force=history.contact_force, missed=history.missed)
+
+
+def _first(trajectory: Trajectory, name: str) -> torch.Tensor:
+    return torch.from_numpy(getattr(trajectory, name)[:1].copy())
+
+
+def _couple(trajectory: Trajectory, dtype: torch.dtype) -> Callable[[int], torch.Tensor]:
+    """Couple on the elements in a step, N m, ``(1, 3, n_elements)``."""
+    settings = trajectory.config["task"]["actuation"]
+    actuation = Actuation(
+        trajectory.rod,
+        trajectory.n_agents,
+        settings["max_torque"],
+        settings["basis"],
+        settings["scaling"],
+        dtype=dtype,
+    )
+    return lambda step: actuation.couple(torch.from_numpy(trajectory.action[step : step + 1]))
+
+
+def _force(trajectory: Trajectory) -> Callable[[int], NDArray[np.float64]] | None:
+    """Force on the nodes in a step, N, ``(3, n_nodes)``; None if there never is one."""
+    if not trajectory.tip_force.any():
+        return None
+
+    def force(step: int) -> NDArray[np.float64]:
+        values = np.zeros((3, trajectory.rod.n_nodes))
+        values[:, -1] = trajectory.tip_force[step]
+        return values
+
+    return force
+
+
+def _cylinders(trajectory: Trajectory, dtype: torch.dtype) -> Cylinders | None:
+    count = len(trajectory.cylinders["start"])
+    if count == 0:
+        return None
+    fields = {name: torch.from_numpy(values).to(dtype).unsqueeze(0) for name, values in trajectory.cylinders.items()}
+    return Cylinders(**fields, mask=torch.ones((1, count), dtype=torch.bool), batch_size=[1])

@@ -1,0 +1,234 @@
+"""One episode of one arm as arrays: recorded from a policy, saved to and loaded from one ``.npz`` file."""
+
+import io
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softgm_bench.config import UserError
+from softgm_bench.rod.actuation import control_points
+from softgm_bench.rod.parameters import RodParameters, rod_constants
+from softgm_bench.runs.folder import write_where_asked
+
+FORMAT = 1
+CYLINDER_FIELDS = ("start", "axis", "length", "radius")
+# Members of a file, besides the groups: those of the rod have its type, float64 or float32.
+ROD = ("position", "director", "velocity", "omega")
+ARRAYS = (*ROD, "contact", "action", "tip_force", "reward", "target")
+GROUPS = ("observation", "reward_terms", "cylinders", "attention")
+PLAIN = ("success", "diverged", "config", "info")
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """An episode of T control steps: T + 1 states, from the reset to the end, and T actions between them.
+
+    Attributes:
+        position: nodes, m, ``(T + 1, 3, n_nodes)``, of the rod's type as are the next three.
+        director: rows d1, d2, d3 of every element's material frame, ``(T + 1, 3, 3, n_elements)``.
+        velocity: of nodes, m/s, ``(T + 1, 3, n_nodes)``.
+        omega: angular velocity in the material frame, rad/s, ``(T + 1, 3, n_elements)``.
+        contact: which nodes touch a cylinder, ``(T + 1, n_nodes)`` bool.
+        action: as the arm applied them, in [-1, 1], ``(T, N, 2)`` float32.
+        tip_force: external force on the tip, N, ``(T, 3)`` float64; zeros without a disturbance.
+        reward: the team's, ``(T,)`` float32.
+        target: m, ``(3,)`` float64.
+        observation: what the policy was shown, by key joined with "/": ``(T + 1, ...)``.
+        reward_terms: by name, ``(T,)`` float32.
+        cylinders: ``start`` (C, 3), ``axis`` (C, 3), ``length`` (C,), ``radius`` (C,) of the C that exist, float64, m.
+        attention: empty, or ``stage1`` ``(T, L, H, N, N + M)`` and ``stage2`` ``(T, L, H, N, N)`` float32.
+        success: whether the tip reached the target.
+        diverged: whether the simulation broke in the last step; its state is then that before the step.
+        config: of the simulation and the policy, plain values.
+        info: label, task, frames, seed, episode, episodes, deterministic, backend, versions.
+    """
+
+    position: Array
+    director: Array
+    velocity: Array
+    omega: Array
+    contact: Array
+    action: Array
+    tip_force: Array
+    reward: Array
+    target: Array
+    observation: dict[str, Array]
+    reward_terms: dict[str, Array]
+    cylinders: dict[str, Array]
+    attention: dict[str, Array]
+    success: bool
+    diverged: bool
+    config: dict[str, Any] = field(repr=False)
+    info: dict[str, Any] = field(repr=False)
+
+    def __post_init__(self) -> None:
+        """Refuse arrays that don't belong together.
+
+        Raises:
+            ValueError: naming the first one and the shape that it should have.
+        """
+        steps, n_agents, n = self.steps, self.n_agents, self.position.shape[-1] - 1
+        shapes = {
+            "position": (steps + 1, 3, n + 1),
+            "director": (steps + 1, 3, 3, n),
+            "velocity": (steps + 1, 3, n + 1),
+            "omega": (steps + 1, 3, n),
+            "contact": (steps + 1, n + 1),
+            "action": (steps, n_agents, 2),
+            "tip_force": (steps, 3),
+            "reward": (steps,),
+            "target": (3,),
+        }
+        for name, shape in shapes.items():
+            if getattr(self, name).shape != shape:
+                raise ValueError(f"{name} has shape {getattr(self, name).shape}: it must be {shape}")
+        leading = {"observation": steps + 1, "reward_terms": steps, "attention": steps}
+        for group, size in leading.items():
+            for name, values in getattr(self, group).items():
+                if len(values) != size:
+                    raise ValueError(f"{group}/{name} has {len(values)} entries: it must have {size}")
+        count = len(self.cylinders["start"])
+        for name, shape in zip(CYLINDER_FIELDS, ((count, 3), (count, 3), (count,), (count,)), strict=True):
+            if self.cylinders[name].shape != shape:
+                raise ValueError(f"cylinders/{name} has shape {self.cylinders[name].shape}: it must be {shape}")
+
+    @property
+    def steps(self) -> int:
+        """T, control steps."""
+        return len(self.action)
+
+    @property
+    def n_agents(self) -> int:
+        """N."""
+        return self.action.shape[1]
+
+    @cached_property
+    def rod(self) -> RodParameters:
+        """The arm's physical parameters."""
+        values = self.config["rod"]
+        return RodParameters(**values | {"gravity": tuple(values["gravity"])})
+
+    @cached_property
+    def agent_nodes(self) -> NDArray[np.int64]:
+        """Index of each agent's node, ``(N,)``."""
+        rod = self.rod
+        return np.round(control_points(self.n_agents, rod.base_length) * (rod.n_elements / rod.base_length)).astype(int)
+
+    def radius(self) -> NDArray[np.float64]:
+        """Radius of every element, m, ``(T + 1, n_elements)``: an element keeps its volume when it is stretched."""
+        length = np.linalg.norm(np.diff(self.position.astype(np.float64), axis=-1), axis=1)
+        return np.sqrt(rod_constants(self.rod).volume / (np.pi * length))
+
+
+def save(trajectory: Trajectory, path: Path) -> None:
+    """Write a trajectory; the format is described in ``docs/trajectories.md``.
+
+    Raises:
+        UserError: the file's name does not end in ``.npz``, or it cannot be written.
+    """
+    if path.suffix != ".npz":
+        raise UserError(f"{path}: a trajectory's file ends in .npz")
+    arrays = {name: getattr(trajectory, name) for name in ARRAYS}
+    for group in GROUPS:
+        arrays |= {f"{group}/{name}": values for name, values in getattr(trajectory, group).items()}
+    plain = {"format": FORMAT} | {name: getattr(trajectory, name) for name in PLAIN}
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, metadata=np.array(json.dumps(plain)), **arrays)
+    write_where_asked(path, buffer.getvalue())
+
+
+def load(path: Path) -> Trajectory:
+    """Read what ``save`` wrote, without running any code in it.
+
+    Raises:
+        UserError: the file is missing, damaged or no trajectory of this version.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise UserError(f"{path}: {error.strerror}") from error
+    try:
+        with np.load(io.BytesIO(content), allow_pickle=False) as members:
+            arrays: dict[str, Any] = {name: members[name] for name in members.files}  # reading compares checksums
+        plain = json.loads(str(arrays.pop("metadata")))
+        if plain.pop("format") != FORMAT:
+            raise UserError(f"{path}: a trajectory of another version of this program; record it again")
+        groups: dict[str, Any] = {group: {} for group in GROUPS}
+        for name in [name for name in arrays if "/" in name]:
+            group, _, member = name.partition("/")
+            groups[group][member] = arrays.pop(name)
+        return Trajectory(**arrays, **groups, **plain)
+    except UserError:
+        raise
+    except Exception as error:  # damage shows as a BadZipFile, zlib.error, ValueError, KeyError, TypeError and more
+        raise UserError(f"{path}: damaged or no trajectory; record it again") from error
+
+
+def record(
+    trained: Any,
+    seed: int,
+    episode: int = 0,
+    horizon: int | None = None,
+    deterministic: bool = True,
+    attention: bool = False,
+    episodes: int | None = None,
+) -> Trajectory:
+    """An episode of an evaluation, bit by bit.
+
+    Scenes are drawn for all episodes of an evaluation together, and a network's rounding depends on how many it acts
+    for; so all of them are simulated until this one ends.
+
+    Args:
+        trained: a ``TrainedPolicy``.
+        seed: of the evaluation.
+        episode: number of the episode in the evaluation, from 0.
+        horizon: control steps until an episode ends, the task's by default.
+        deterministic: act by the mode of the policy, otherwise by a sample.
+        attention: record the attention weights too, if the policy has an encoder with attention.
+        episodes: of the evaluation, all at once; ``episode + 1`` by default. Another number gives another episode.
+
+    Raises:
+        UserError: an argument makes no sense, or the task has no arm.
+    """
+    from softgm_bench.episodes.recording import record_episode  # late: reading a file need not wait for torch
+
+    return record_episode(trained, seed, episode, horizon, deterministic, attention, episodes)
+
+
+def record_or_load(
+    path: Path,
+    seed: int = 0,
+    episode: int = 0,
+    horizon: int | None = None,
+    deterministic: bool = True,
+    attention: bool = False,
+    episodes: int | None = None,
+    overrides: Sequence[str] = (),
+) -> Trajectory:
+    """The trajectory in an ``.npz`` file; or ``record`` with the policy of a run folder, checkpoint or policy's file.
+
+    ``overrides`` are settings on top of those that the policy was trained with. A file takes none of the arguments.
+
+    Raises:
+        UserError: the source is missing or damaged, or an argument makes no sense.
+    """
+    if path.suffix == ".npz":
+        if overrides:
+            raise UserError(f"{overrides[0]}: {path} is a recorded episode, which takes no settings; name a policy")
+        return load(path)
+    from softgm_bench.episodes import policy
+
+    return record(policy.load(path, overrides=overrides), seed, episode, horizon, deterministic, attention, episodes)
+
+
+def describe(info: Mapping[str, Any]) -> str:
+    """A trajectory's ``info`` in a few words, for titles: ``softgm on wall, seed 0, episode 3 of 100``."""
+    return f"{info['label']} on {info['task']}, seed {info['seed']}, episode {info['episode']} of {info['episodes']}"

@@ -1,0 +1,137 @@
+"""Going on with a run that was broken off: whether it can be, and from which checkpoint.
+
+What a checkpoint holds is ``Run.state_dict``. On the same machine, with the same versions and number of threads, a run
+that was broken off and gone on with writes the numbers of one that was not, bit by bit.
+"""
+
+import json
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+from omegaconf import DictConfig, OmegaConf
+from yaml import YAMLError
+
+from softgm_bench.config import Config, UserError, plain, typed
+from softgm_bench.config.explain import USER_ERRORS
+from softgm_bench.episodes.summary import versions
+from softgm_bench.runs import checkpoint
+from softgm_bench.runs import folder as run_folder
+from softgm_bench.runs.folder import ANEW, RunFolder
+
+if TYPE_CHECKING:
+    from softgm_bench.runs.loop import Run
+
+TOTAL_FRAMES = "experiment.total_frames"
+# What a run may be gone on with other values of: no number depends on them (on threads, only the last bits).
+FREE = ("run_dir", "overwrite", "resume", "threads", "logger", "experiment.checkpoint", TOTAL_FRAMES)
+
+
+def finished(config: Config, frames: int) -> dict[str, Any] | None:
+    """Summary of the run in ``run_dir`` if it has come to its end, which is then said; None otherwise.
+
+    Args:
+        config: of the run.
+        frames: where its end is; a run that ended earlier was shorter and is to go on.
+
+    Raises:
+        UserError: the run has other settings, or cannot be read.
+    """
+    folder = RunFolder(Path(config.run_dir))
+    if not folder.summary.exists():
+        return None
+    _refuse_other_settings(config, folder)
+    try:
+        summary = json.loads(folder.summary.read_text())
+        if summary["frames"] < frames:
+            return None
+    except (ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{folder.summary}: damaged; {ANEW}") from error
+    print(f"{folder.path}: finished already")
+    return summary
+
+
+def newest_state(config: Config) -> dict[str, Any] | None:
+    """The newest whole checkpoint of the run in ``run_dir``; None, and a line that says so, if it has none yet.
+
+    A damaged one is passed over with a line.
+
+    Raises:
+        UserError: the run has other settings or cannot be read, or all of its checkpoints are damaged.
+    """
+    folder = RunFolder(Path(config.run_dir))
+    paths = checkpoint.in_order(folder.checkpoints)
+    if paths or folder.config.exists():
+        _refuse_other_settings(config, folder)
+    for path in reversed(paths):
+        try:
+            state = checkpoint.load(path)
+        except UserError as error:
+            _say(f"passed over {error}")
+            continue
+        _say(f"{folder.path}: going on after {state['frames']} frames")
+        return state
+    if paths:
+        raise UserError(f"{folder.checkpoints}: no checkpoint here is whole; {ANEW}")
+    _say(f"{folder.path}: no checkpoint to go on from, the run begins anew")
+    return None
+
+
+def restore(run: "Run", state: dict[str, Any]) -> None:
+    """Put a run that has just been built, and the files in its folder, where a checkpoint was written.
+
+    Raises:
+        UserError: another version wrote the checkpoint, or what was written down before it is missing.
+    """
+    try:
+        run.load_state_dict(state)
+        before = state["versions"]
+    except (KeyError, AttributeError, TypeError, RuntimeError, ValueError) as error:
+        raise UserError(f"{run.folder.path}: this version cannot go on from its checkpoint; {ANEW}") from error
+    for name, version in versions().items():
+        if before.get(name) != version:
+            _say(f"{run.folder.path}: {name} was {before.get(name)} and is {version}: numbers may not repeat")
+    run_folder.cut_back(run.folder, plain(run.config), run.iteration, run.evaluations)
+
+
+def _refuse_other_settings(config: Config, folder: RunFolder) -> None:
+    """Compare with ``config.yaml``, which is written before anything else.
+
+    Raises:
+        UserError: naming the first setting of another value, groups' names first.
+    """
+    try:
+        held = _flat(plain(typed(cast(DictConfig, OmegaConf.create(folder.config.read_text())))))
+    except (ValueError, TypeError, AttributeError, YAMLError, *USER_ERRORS) as error:
+        raise UserError(f"{folder.config}: missing or of another version; {ANEW}") from error
+    wanted = _flat(plain(config))
+    if wanted[TOTAL_FRAMES] < held[TOTAL_FRAMES]:
+        raise UserError(f"{TOTAL_FRAMES}={wanted[TOTAL_FRAMES]}: the run has {held[TOTAL_FRAMES]}; it can only grow")
+    free = list(FREE)
+    if getattr(config.algo, "lr_schedule", "") == "constant":
+        free.append("algo.lr_schedule_frames")  # follows total_frames, and nobody reads it
+    for key in sorted(held.keys() | wanted.keys(), key=lambda key: (not key.endswith(".name"), key)):
+        if held.get(key) != wanted.get(key) and not f"{key}.".startswith(tuple(f"{name}." for name in free)):
+            now, then = (_written(values.get(key)) for values in (wanted, held))
+            raise UserError(f"{key}={now}: the run in {folder.path} has {then}; give that, or choose another run_dir")
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Values by dotted key; tuples become lists, as they are in YAML."""
+    flat: dict[str, Any] = {}
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            flat |= _flat(value, f"{prefix}{name}.")
+        else:
+            flat[prefix + name] = list(value) if isinstance(value, tuple) else value
+    return flat
+
+
+def _written(value: Any) -> str:
+    """As it is written on the command line."""
+    return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def _say(line: str) -> None:
+    print(line, file=sys.stderr)

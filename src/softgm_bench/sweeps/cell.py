@@ -1,0 +1,243 @@
+"""One cell of a sweep: skipped if it has finished, else trained in a process of its own and written down.
+
+``run`` is what launchers call, in whatever process; it returns only strings and raises nothing, so that no cell can
+stop another. The training itself is ``python -m softgm_bench.sweeps.cell`` with the job on its standard
+input: it has the number of threads that it was given from its beginning, its memory goes when it ends, and a crash is
+its own. A process whose parent is gone stops as on SIGTERM, so that nothing outlives a sweep that was killed.
+"""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
+
+from softgm_bench.config import typed, validate
+from softgm_bench.config.explain import USER_ERRORS, explain
+from softgm_bench.runs.folder import RunFolder, to_json, write_atomically
+from softgm_bench.sweeps import record as sweep_record
+
+RECORDS = "SOFTGM_SWEEP"  # environment variable: the folder where outcomes go
+CWD = "SOFTGM_SWEEP_CWD"  # and what relative run folders are relative to
+MAIN = "SOFTGM_SWEEP_PID"  # and the process that the user started
+PARENT = os.getppid()  # of a launcher's worker, while whoever launched it is alive
+LOG = "output.log"  # in the run folder: what the training printed
+THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+DONE, SKIPPED, FAILED, INTERRUPTED = "done", "skipped", "failed", "interrupted"
+NOT_COMPARED = ("run_dir", "overwrite", "resume", "threads", "logger", "experiment.checkpoint")
+PATIENCE = 30.0  # seconds that a training has to save a checkpoint when it is stopped
+POLL = 0.5  # seconds between looks at whether the parent is still there
+
+
+def run(composed: DictConfig) -> str:
+    """Do one cell; returns its outcome, which it also leaves where the sweep looks for it."""
+    _leave_if_orphaned(None)
+    hydra = HydraConfig.get()
+    overrides = list(hydra.overrides.task)
+    cwd = Path(os.environ.get(CWD, "."))
+    run_dir = ""
+    try:
+        values: Any = OmegaConf.to_container(composed, resolve=True)
+        run_dir = values["run_dir"]
+        outcome = _do(values, overrides, cwd)
+    except KeyboardInterrupt:
+        _leave(hydra.job.num, run_dir, overrides, {"outcome": INTERRUPTED, "line": "interrupted"})
+        raise
+    except USER_ERRORS as error:
+        outcome = {"outcome": FAILED, "line": explain(error, overrides)}
+    if run_dir and outcome["outcome"] == FAILED:
+        sweep_record.write_failure(cwd / run_dir, outcome["line"])
+    _leave(hydra.job.num, run_dir, overrides, outcome)
+    return outcome["outcome"]
+
+
+def finished(values: Mapping[str, Any], run_dir: Path) -> str:
+    """What a finished run with these settings achieved; empty if the folder holds none.
+
+    Settings are compared as far as YAML has them, without building anything: what differs is left to ``resume``.
+    """
+    folder = RunFolder(run_dir)
+    try:
+        summary = json.loads(folder.summary.read_text())
+        held: Any = OmegaConf.to_container(OmegaConf.load(folder.config))
+        if summary["frames"] < values["experiment"]["total_frames"] or _differ(values, held):
+            return ""
+        return sweep_record.achieved(summary)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OmegaConfBaseException, YAMLError):
+        return ""
+
+
+def _differ(wanted: Mapping[str, Any], held: Mapping[str, Any], prefix: str = "") -> bool:
+    """Whether a key that both have has two values."""
+    for key in wanted.keys() & held.keys():
+        name, ours, theirs = f"{prefix}{key}", wanted[key], held[key]
+        if name in NOT_COMPARED:
+            continue
+        if isinstance(ours, Mapping) and isinstance(theirs, Mapping):
+            if _differ(ours, theirs, f"{name}."):
+                return True
+        elif ours != theirs:
+            return True
+    return False
+
+
+def _do(values: dict[str, Any], overrides: list[str], cwd: Path) -> dict[str, str]:
+    run_dir = cwd / values["run_dir"]
+    state = sweep_record.state(run_dir)
+    if state.kind == sweep_record.RUNNING:
+        return {"outcome": FAILED, "line": f"{state.detail or 'another process'}: at work in it already"}
+    if not values["overwrite"]:
+        if achieved := finished(values, run_dir):
+            sweep_record.forget_failure(run_dir)
+            return {"outcome": SKIPPED, "line": f"finished before, {achieved}"}
+        values["resume"] = True
+    began = time.monotonic()
+    outcome = _train_apart(values, overrides, cwd)
+    if outcome["outcome"] == DONE:
+        outcome["line"] += f", {(time.monotonic() - began) / 60:.1f} min"
+    return outcome
+
+
+def _train_apart(values: Mapping[str, Any], overrides: list[str], cwd: Path) -> dict[str, str]:
+    """Start the training and wait for it; it stops with this process or with the one that this is a worker of."""
+    environment = dict(os.environ)
+    if values["threads"]:
+        environment |= dict.fromkeys(THREADS, str(values["threads"]))
+    command = [sys.executable, "-m", "softgm_bench.sweeps.cell"]
+    child = subprocess.Popen(
+        command,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=cwd,
+        env=environment,
+        start_new_session=True,  # Ctrl-C in a terminal reaches this process, which passes it on
+    )
+    text: str | None = json.dumps({"config": values, "overrides": overrides, "parent": os.getpid()})
+    try:
+        while True:
+            try:
+                answer, _ = child.communicate(text, timeout=POLL)
+                break
+            except subprocess.TimeoutExpired:
+                text = None
+            _leave_if_orphaned(child)
+    except BaseException:
+        _stop(child)
+        raise
+    return _outcome(answer, child.returncode, Path(values["run_dir"]))
+
+
+def _outcome(answer: str, status: int, run_dir: Path) -> dict[str, str]:
+    """What the training said last; if it said nothing, what became of its process."""
+    try:
+        return json.loads(answer.splitlines()[-1])
+    except (IndexError, ValueError):
+        pass
+    if status >= 0:
+        line = f"ended with exit status {status}; see {run_dir / LOG}"
+    else:
+        hint = " (memory?)" if -status == signal.SIGKILL else f"; see {run_dir / LOG}"
+        line = f"killed by {signal.Signals(-status).name}{hint}"
+    return {"outcome": FAILED, "line": line}
+
+
+def _leave_if_orphaned(child: subprocess.Popen | None) -> None:
+    """End this worker and its training if nobody is left to launch or to listen; the user's own process stays."""
+    if os.getppid() != PARENT and os.environ.get(MAIN) != str(os.getpid()):
+        if child is not None:
+            _stop(child)
+        os._exit(1)
+
+
+def _stop(child: subprocess.Popen) -> None:
+    child.terminate()
+    try:
+        child.wait(PATIENCE)
+    except (subprocess.TimeoutExpired, KeyboardInterrupt):
+        child.kill()
+        child.wait()
+
+
+def _leave(number: int, run_dir: str, overrides: list[str], outcome: Mapping[str, str]) -> None:
+    folder = os.environ.get(RECORDS)
+    if folder:
+        record = {"number": number, "run_dir": run_dir, "overrides": overrides, **outcome}
+        with suppress(OSError):  # a full disk; failure.json could not be written either
+            write_atomically(Path(folder) / f"{number:06d}.json", to_json(record).encode())
+
+
+def main() -> int:
+    """Train the job on standard input; the last line on standard output says what came of it."""
+    job = json.loads(sys.stdin.read())
+    _stop_with(job["parent"])
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "w")
+    answer = _train(job["config"], job["overrides"])
+    print(json.dumps(answer), file=answers, flush=True)
+    return 0
+
+
+def _train(values: Mapping[str, Any], overrides: list[str]) -> dict[str, str]:
+    try:
+        config = typed(OmegaConf.create(dict(values)))
+        validate(config)
+        from softgm_bench.runs.loop import train  # late: a refused job need not wait for it
+
+        run_dir = Path(config.run_dir)
+        with sweep_record.running(run_dir), _logged(run_dir / LOG):
+            try:
+                return {"outcome": DONE, "line": sweep_record.achieved(train(config))}
+            except Exception as error:  # a sweep goes on, whatever happened to one cell
+                traceback.print_exc()
+                line = explain(error, overrides) if isinstance(error, USER_ERRORS) else _unexpected(error, run_dir)
+                return {"outcome": FAILED, "line": line}
+    except USER_ERRORS as error:
+        return {"outcome": FAILED, "line": explain(error, overrides)}
+    except KeyboardInterrupt as interruption:
+        return {"outcome": INTERRUPTED, "line": str(interruption) or "interrupted; nothing was saved"}
+
+
+def _unexpected(error: Exception, run_dir: Path) -> str:
+    lines = str(error).splitlines()
+    return f"{type(error).__name__}: {lines[0] if lines else ''}; see {run_dir / LOG}"
+
+
+@contextmanager
+def _logged(path: Path) -> Iterator[None]:
+    """Send everything that is printed, also by compiled code, to the end of a file."""
+    with path.open("ab") as log:
+        for stream in (sys.stdout, sys.stderr):
+            stream.flush()
+            os.dup2(log.fileno(), stream.fileno())
+    try:
+        yield
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+
+
+def _stop_with(parent: int) -> None:
+    """Send this process SIGTERM once its parent is another."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(POLL)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,165 @@
+"""The Gymnasium adapters keep Gymnasium's contract and repeat ``SoftArmEnv`` bit by bit."""
+
+import numpy as np
+import pytest
+import torch
+
+from softgm_bench.config import UserError
+from softgm_bench.envs import keys, make_env
+
+pytest.importorskip("gymnasium", reason="an optional extra: pip install 'softgm-bench[pettingzoo]'")
+
+import gymnasium
+from gymnasium.utils.env_checker import check_env, data_equivalence
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
+
+from softgm_bench.adapters.gymnasium_vector import SoftArmGymnasiumEnv, SoftArmVectorEnv, register
+from softgm_bench.envs.tasks import TASKS
+
+ENVS = 5
+QUICK = "rod.substeps=10"  # a tenth of a control step: these tests are about the adapter
+EASY = ("basic", 9, [QUICK, "task.success_radius=0.55"])  # episodes end at different times
+
+
+def actions_for(env, steps):
+    generator = np.random.default_rng(0)
+    return generator.uniform(-1.0, 1.0, (steps, *env.action_space.shape)).astype(np.float32)
+
+
+def joint(td):
+    return np.concatenate([td[key].numpy().reshape(td.batch_size[0], -1) for key in keys.OBSERVATION], axis=1)
+
+
+def column(td, *key):
+    return td[key].squeeze(-1).numpy()
+
+
+@pytest.mark.parametrize(
+    ("task", "horizon", "overrides"), [EASY, ("wall", 12, ["task.slots=32"])], ids=["basic", "wall"]
+)
+def test_a_rollout_is_soft_arm_env_s(settings, task, horizon, overrides):
+    env = SoftArmVectorEnv(task, ENVS, 3, horizon, overrides)
+    config = settings(f"task={task}", *overrides)
+    peer = make_env(config.task, config.rod, ENVS, 3, horizon)
+    observation, infos = env.reset()
+    td = peer.reset()
+    ends = []
+    for action in actions_for(env, 30):
+        assert np.array_equal(observation, joint(td))
+        assert np.array_equal(infos["distance"], column(td, *keys.DISTANCE))
+        last = peer.step(td.set(keys.ACTION, torch.from_numpy(action).reshape(ENVS, -1, 2)))["next"]
+        observation, reward, terminated, truncated, infos = env.step(action)
+        assert np.array_equal(reward, column(last, keys.REWARD))
+        assert np.array_equal(terminated, column(last, keys.TERMINATED))
+        assert np.array_equal(truncated, column(last, keys.TRUNCATED))
+        done = terminated | truncated
+        ends.append(done)
+        td = last
+        if done.any():
+            assert np.array_equal(np.stack(infos["final_obs"][done]), joint(last)[done])
+            assert all(row is None for row in infos["final_obs"][~done])
+            assert np.array_equal(infos["_final_obs"], done)
+            success = infos["final_info"]["success"]
+            assert np.array_equal(success, column(last, *keys.SUCCESS) & done)
+            td = peer.reset(last.clone().set("_reset", torch.from_numpy(done).unsqueeze(-1)))
+        else:
+            assert "final_obs" not in infos
+    some = np.stack(ends)
+    assert some.sum() >= 2 * ENVS
+    assert (some.any(axis=1) & ~some.all(axis=1)).any() == (task == "basic")  # ends at different times
+
+
+def test_one_environment_gives_what_gymnasium_s_own_vector_environment_makes_of_it():
+    task, horizon, overrides = EASY
+    env = SoftArmVectorEnv(task, 1, 0, horizon, overrides)
+    own = SyncVectorEnv(
+        [lambda: SoftArmGymnasiumEnv(task, 0, horizon, overrides)], autoreset_mode=AutoresetMode.SAME_STEP
+    )
+    assert env.observation_space == own.observation_space
+    assert env.action_space == own.action_space
+    assert env.metadata["autoreset_mode"] == own.metadata["autoreset_mode"]
+    mine, theirs = env.reset(seed=4), own.reset(seed=4)
+    assert data_equivalence(mine, theirs)
+    ends = 0
+    for action in actions_for(env, 30):
+        (*mine, info), (*theirs, expected) = env.step(action), own.step(action)
+        assert data_equivalence(mine, theirs)
+        final, expected_final = (infos.pop("final_obs", None) for infos in (info, expected))
+        assert (final is None) == (expected_final is None)
+        if final is not None:
+            ends += 1
+            assert np.array_equal(final[0], expected_final[0])
+        assert data_equivalence(info, expected)
+    assert ends > 2
+
+
+def test_gymnasium_s_own_check_passes():
+    check_env(SoftArmGymnasiumEnv("basic", overrides=[QUICK]), skip_render_check=True)
+
+
+def test_registered_names_make_environments():
+    register()
+    assert {f"SoftArm-{task}-v0" for task in TASKS} <= set(gymnasium.registry)
+    with gymnasium.make("SoftArm-structured-v0", overrides=[QUICK]) as one:
+        assert one.observation_space.contains(one.reset(seed=0)[0])
+        assert one.unwrapped.spec.id == "SoftArm-structured-v0"
+    many = gymnasium.make_vec("SoftArm-basic-v0", num_envs=3, horizon=4, overrides=[QUICK])
+    assert isinstance(many, SoftArmVectorEnv)
+    observation, _ = many.reset(seed=0)
+    assert many.observation_space.contains(observation)
+    assert observation.shape == (3, 6 * 8 + 6)
+
+
+def test_episode_statistics_are_those_of_whole_episodes():
+    task, horizon, overrides = EASY
+    env = RecordEpisodeStatistics(SoftArmVectorEnv(task, ENVS, 3, horizon, overrides))
+    env.reset()
+    returns, lengths, episodes = np.zeros(ENVS), np.zeros(ENVS, dtype=int), 0
+    for action in actions_for(env, 20):
+        _, reward, terminated, truncated, infos = env.step(action)
+        returns, lengths = returns + reward, lengths + 1
+        done = terminated | truncated
+        if done.any():
+            assert np.array_equal(infos["episode"]["r"][done], returns[done])
+            assert np.array_equal(infos["episode"]["l"][done], lengths[done])
+            episodes += done.sum()
+        returns[done], lengths[done] = 0.0, 0
+    assert env.episode_count == episodes > ENVS
+
+
+def test_a_seed_gives_the_same_episodes_whatever_came_before():
+    env, other = (SoftArmVectorEnv("basic", 2, None, 4, [QUICK]) for _ in range(2))
+    env.reset()
+    env.step(actions_for(env, 1)[0])
+    first, second = env.reset(seed=7), other.reset(seed=7)
+    assert data_equivalence(first, second)
+    assert not np.array_equal(*first[0])  # the environments have scenes of their own
+    for action in actions_for(env, 10):
+        (*mine, _), (*theirs, _) = env.step(action), other.step(action)
+        assert data_equivalence(mine, theirs)
+    assert not data_equivalence(env.reset(seed=8), first)
+
+
+def test_what_cannot_be_is_refused_in_one_line():
+    with pytest.raises(ValueError, match="num_envs is 0"):
+        SoftArmVectorEnv("basic", 0)
+    with pytest.raises(ValueError, match="task is 'moon'"):
+        SoftArmVectorEnv("moon")
+    with pytest.raises(ValueError, match="render_mode is 'human'"):
+        SoftArmGymnasiumEnv("basic", render_mode="human")
+    with pytest.raises(UserError, match=r"task\.slot"):
+        SoftArmGymnasiumEnv("basic", overrides=["task.slot=1"])
+    for env in (SoftArmVectorEnv("basic", 2, overrides=[QUICK]), SoftArmGymnasiumEnv("basic", overrides=[QUICK])):
+        action = np.zeros(env.action_space.shape)
+        with pytest.raises(ValueError, match=r"reset\(\)"):
+            env.step(action)
+        with pytest.raises(ValueError, match="seed is -1"):
+            env.reset(seed=-1)
+        env.reset()
+        with pytest.raises(ValueError, match="action has shape"):
+            env.step(action[..., 1:])
+        with pytest.raises(ValueError, match="not finite"):
+            env.step(action + np.inf)
+    with pytest.raises(ValueError, match="reset_mask"):
+        SoftArmVectorEnv("basic", 2).reset(options={"reset_mask": np.array([True, False])})

@@ -1,0 +1,71 @@
+import pytest
+import torch
+
+from softgm_bench.config import UserError
+from softgm_bench.runs import checkpoint
+
+
+def a_state():
+    network = torch.nn.Linear(3, 2)
+    optimiser = torch.optim.Adam(network.parameters())
+    network(torch.ones(1, 3)).sum().backward()
+    optimiser.step()
+    return {
+        "algorithm": {"network": network.state_dict(), "optimiser": optimiser.state_dict()},
+        "random": checkpoint.random_state(),
+        "config": {"seed": 1, "threads": None, "range": [0.1, 0.2]},
+    }
+
+
+def test_what_is_saved_is_loaded_bit_for_bit(tmp_path):
+    state = a_state()
+
+    loaded = checkpoint.load(checkpoint.save(tmp_path, 640, state, keep=2))
+
+    assert loaded["frames"] == 640
+    assert loaded["config"] == state["config"]
+    assert torch.equal(loaded["random"]["cpu"], state["random"]["cpu"])
+    for name, value in state["algorithm"]["network"].items():
+        assert torch.equal(loaded["algorithm"]["network"][name], value)
+    moments = [saved["algorithm"]["optimiser"]["state"][0]["exp_avg"] for saved in (loaded, state)]
+    assert torch.equal(*moments)
+
+
+def test_only_the_newest_are_kept_in_the_order_of_frames(tmp_path):
+    paths = [checkpoint.save(tmp_path, frames, {}, keep=2) for frames in (900, 1000, 20000)]
+
+    assert sorted(tmp_path.iterdir()) == paths[1:]
+    assert checkpoint.latest(tmp_path) == paths[-1]
+    assert checkpoint.latest(tmp_path / "nowhere") is None
+
+
+def test_damaged_foreign_and_missing_files_are_refused_in_one_line(tmp_path):
+    path = checkpoint.save(tmp_path, 1, a_state(), keep=1)
+    whole = path.read_bytes()
+    foreign = tmp_path / "foreign.pt"
+    torch.save({"weights": torch.ones(2)}, foreign)
+
+    flipped = bytearray(whole)
+    flipped[whole.index(torch.get_rng_state()[100:200].numpy().tobytes())] ^= 1
+    for content in (bytes(flipped), whole[: len(whole) // 2], whole[:10], b"", b"not a checkpoint"):
+        path.write_bytes(content)
+        with pytest.raises(UserError, match=r"^\S+: damaged or no checkpoint[^\n]*$"):
+            checkpoint.load(path)
+    with pytest.raises(UserError, match="no checkpoint of this program"):
+        checkpoint.load(foreign)
+    with pytest.raises(UserError, match="No such file"):
+        checkpoint.load(tmp_path / "missing.pt")
+
+
+class Bomb:
+    def __reduce__(self):
+        return print, ("boom",)
+
+
+def test_loading_runs_no_code_from_the_file(tmp_path, capsys):
+    path = tmp_path / "bomb.pt"
+    torch.save({"format": checkpoint.FORMAT, "bomb": Bomb()}, path)
+
+    with pytest.raises(UserError):
+        checkpoint.load(path)
+    assert "boom" not in capsys.readouterr().out

@@ -1,0 +1,157 @@
+"""Any algorithm with any model on any task: that they run, and what their policies read."""
+
+import csv
+import math
+
+import pytest
+import torch
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from softgm_bench.algorithms import algorithm_configs, build_algorithm
+from softgm_bench.config import compose
+from softgm_bench.envs import keys, make_env
+from softgm_bench.rod.parameters import RodParameters
+from softgm_bench.runs import checkpoint
+from softgm_bench.runs.loop import train
+
+TASKS = ("basic", "structured", "wall", "wall_narrow", "wall_fixed")
+ALGORITHMS = tuple(algorithm_configs())
+ON_POLICY = ("softgm", "softgm_no_stage1", "softgm_no_stage2", "ippo", "mappo")
+MODELS = ("mlp", "softgm")
+# An ablation names switches of SoftGM's encoder, so it has no other model.
+PAIRS = [
+    (algo, model)
+    for algo in ALGORITHMS
+    for model in MODELS
+    if model == "softgm" or not algo.startswith("softgm_no_stage")
+]
+CROSSED = [(algo, model) for algo, model in PAIRS if (model == "softgm") is not algo.startswith("softgm")]
+TINY = (
+    "experiment=smoke",
+    "threads=1",
+    "experiment.total_frames=16",
+    "experiment.num_envs=2",
+    "experiment.steps_per_batch=4",
+    "experiment.train_horizon=3",
+    "experiment.evaluation.interval=16",
+    "experiment.evaluation.episodes=2",
+    "experiment.evaluation.final_episodes=2",
+    "experiment.evaluation.horizon=2",
+    "experiment.evaluation.final_horizon=2",
+    "experiment.checkpoint.interval=16",
+    "rod.n_elements=20",
+)
+TINY_PPO = ("algo.epochs=1", "algo.minibatch_size=8")
+TINY_OFF_POLICY = (
+    "algo.batch_size=4",
+    "algo.random_frames=8",
+    "algo.updates_per_frame=0.25",
+    "algo.replay_capacity=32",
+)
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def check_run(folder, algo, *overrides):
+    """Train at smoke scale; every iteration is written down, what was learnt from is finite, a checkpoint is left."""
+    sizes = TINY_PPO if algo in ON_POLICY else TINY_OFF_POLICY
+    summary = train(compose([*TINY, *sizes, f"algo={algo}", f"run_dir={folder}", *overrides]))
+    with (folder / "metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    losses = {name: float(value) for name, value in rows[-1].items() if name.startswith("loss_") or "_norm" in name}
+    assert len(rows) == 2
+    assert len(losses) >= 4
+    assert all(math.isfinite(value) for value in losses.values()), losses
+    assert summary["algo"].startswith(algo)
+    assert summary["frames"] == 16
+    assert summary["final_evaluation"]["episodes"] == 2
+    state = checkpoint.load(checkpoint.latest(folder / "checkpoints"))
+    assert state["config"]["algo"]["name"] == algo
+    return summary
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_every_algorithm_trains_on_every_task(tmp_path, algo, task):
+    check_run(tmp_path, algo, f"task={task}")
+
+
+@pytest.mark.parametrize(("algo", "model"), CROSSED)
+def test_every_algorithm_trains_with_the_other_model_on_the_wall(tmp_path, algo, model):
+    summary = check_run(tmp_path, algo, "task=wall", f"model={model}", "recipe=open")
+    assert (summary["model"], summary["algo"]) == (model, f"{algo}_{model}")
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_every_algorithm_trains_with_an_asymmetric_critic(tmp_path, algo):
+    check_run(tmp_path, algo, "task=wall", "algo.critic.asymmetric=true")
+
+
+@pytest.fixture(scope="module")
+def wall():
+    return make_env(compose(["task=wall"]).task, RodParameters(n_elements=20, substeps=1), num_envs=3, seed=0)
+
+
+def built(algo, model, env, *overrides):
+    """An algorithm whose parameters are all drawn at random, so that no term is hidden by a zero or a small gain."""
+    sizes = () if algo in ON_POLICY else TINY_OFF_POLICY
+    config = compose(["task=wall", f"algo={algo}", f"model={model}", *sizes, *overrides])
+    algorithm = build_algorithm(config.algo, config.model, env)
+    torch.manual_seed(0)
+    with torch.no_grad():
+        for parameter in algorithm.policy.parameters():
+            parameter.normal_(std=0.05)
+    return algorithm
+
+
+def scene(env):
+    """A frame with every entry drawn at random; an edge comes only from an active slot, as the environment has it."""
+    torch.manual_seed(1)
+    td = env.reset()
+    td.update(env.observation_spec.rand())
+    td[keys.EDGE] &= td[keys.SLOT_ACTIVE].unsqueeze(-2) & (torch.rand(td[keys.EDGE].shape) < 0.1)
+    return td
+
+
+def act(policy, td, exploration=ExplorationType.DETERMINISTIC):
+    torch.manual_seed(2)
+    with torch.no_grad(), set_exploration_type(exploration):
+        return policy(td.clone())[keys.ACTION]
+
+
+@pytest.mark.parametrize(("algo", "model"), PAIRS)
+def test_every_policy_reads_the_observation_and_nothing_else(algo, model, wall):
+    policy, td = built(algo, model, wall).policy, scene(wall)
+    observed = td.select(*keys.OBSERVATION)
+    assert set(policy.in_keys) == set(keys.OBSERVATION)
+    assert len(td.keys(include_nested=True, leaves_only=True)) > len(keys.OBSERVATION)
+    for exploration in (ExplorationType.DETERMINISTIC, ExplorationType.RANDOM):
+        assert torch.equal(act(policy, td, exploration), act(policy, observed, exploration))
+    for key in (keys.TARGET, keys.AGENT_POSITION):  # and this it does read
+        other = observed.clone()
+        other[key] += 1.0
+        assert not torch.equal(act(policy, observed), act(policy, other))
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_no_policy_reads_what_its_asymmetric_critic_is_told(algo, wall):
+    policy, td = built(algo, "softgm", wall, "algo.critic.asymmetric=true").policy, scene(wall)
+    other = td.clone()
+    other[keys.PRIVILEGED] += 1.0
+    assert set(policy.in_keys) == set(keys.OBSERVATION)
+    assert torch.equal(act(policy, td), act(policy, other))
+
+
+@pytest.mark.parametrize("moved", [0, 3, 5])
+@pytest.mark.parametrize(("algo", "model"), PAIRS)
+def test_execution_is_decentralised(algo, model, moved, wall):
+    """An agent acts on its own entries and, with SoftGM, on those of agents at most L = 2 places away."""
+    policy, td = built(algo, model, wall).policy.double(), scene(wall)
+    td = td.select(*keys.OBSERVATION).apply(lambda entry: entry.double() if entry.is_floating_point() else entry)
+    other = td.clone()
+    for key in (keys.AGENT_POSITION, keys.AGENT_VELOCITY, keys.PREVIOUS_ACTION):
+        other[key][:, moved] = td[key][:, moved] * 0.5 + 0.1
+    other[keys.EDGE][:, moved] = td[keys.SLOT_ACTIVE] & ~td[keys.EDGE][:, moved]
+    changed = ((act(policy, td) - act(policy, other)).abs() > 1e-11).any(dim=-1).any(dim=0).tolist()
+    reach = 2 if model == "softgm" and algo != "softgm_no_stage2" else 0
+    assert changed == [abs(agent - moved) <= reach for agent in range(6)]
