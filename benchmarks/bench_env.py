@@ -16,8 +16,8 @@ from record import write
 from timing import Stopwatch
 
 from softgm_bench.config import compose
-from softgm_bench.envs import SoftArmEnv, keys, make_env
-from softgm_bench.runs.loop import set_threads
+from softgm_bench.envs import SoftArmEnv, entries, make_env
+from softgm_bench.runs.machine import set_threads
 
 TASKS = ("basic", "structured", "wall")
 SIZES = (1, 16, 64, 256, 1024)
@@ -50,7 +50,7 @@ def measure(task: str, dtype: str, num_envs: int, device: str, repetitions: int)
     stopwatch = watched(env)
     td = env.reset()
     for action in actions[:5]:  # compile, and leave the rest state
-        _, td = env.step_and_maybe_reset(td.set(keys.ACTION, action))
+        _, td = env.step_and_maybe_reset(td.set(entries.ACTION, action))
     steps = min(max(2048 // num_envs, 20), HORIZON)
     best: dict[str, Any] = {"env_steps_per_s": 0.0}
     for _ in range(repetitions):
@@ -58,7 +58,7 @@ def measure(task: str, dtype: str, num_envs: int, device: str, repetitions: int)
         _wait(device)
         start = time.perf_counter()
         for action in actions[:steps]:
-            _, td = env.step_and_maybe_reset(td.set(keys.ACTION, action))
+            _, td = env.step_and_maybe_reset(td.set(entries.ACTION, action))
         _wait(device)
         seconds = time.perf_counter() - start
         if num_envs * steps / seconds > best["env_steps_per_s"]:

@@ -23,10 +23,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "models")
 from observations import observation
 
 from softgm_bench.config import compose
-from softgm_bench.envs import keys
+from softgm_bench.envs import entries
 from softgm_bench.models import build_encoder, graph
 from softgm_bench.models.softgm import SoftGMConfig
-from softgm_bench.runs.loop import keep_memory, set_threads
+from softgm_bench.runs.machine import keep_memory, set_threads
 
 N_AGENTS, N_SLOTS = 6, 128
 DISCOVERED = (0, 32, 128)
@@ -61,18 +61,18 @@ class Geometric(nn.Module):
 
     def _node_types(self, td: TensorDictBase) -> Tensor:
         agents = td.numel() * N_AGENTS
-        slots = int(td[keys.SLOT_ACTIVE].sum())
+        slots = int(td[entries.SLOT_ACTIVE].sum())
         return torch.tensor([graph.AGENT, graph.OBSTACLE]).repeat_interleave(torch.tensor([agents, slots]))
 
 
 def packed_graph(td: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
     """All agents, then all discovered slots of a batch: features ``(V, 22)`` and the two stages' edges ``(2, E)``."""
-    active = td[keys.SLOT_ACTIVE]
+    active = td[entries.SLOT_ACTIVE]
     agents = graph.agent_features(td).flatten(0, -2)
     nodes = torch.cat([agents, graph.slot_features(td)[active]])
     index = torch.full(active.shape, -1, dtype=torch.long)
     index[active] = len(agents) + torch.arange(int(active.sum()))
-    environment, agent, slot = td[keys.EDGE].nonzero(as_tuple=True)
+    environment, agent, slot = td[entries.EDGE].nonzero(as_tuple=True)
     entity_edges = torch.stack([index[environment, slot], environment * N_AGENTS + agent])
     first = torch.arange(len(agents)).unflatten(0, (-1, N_AGENTS))
     left, right = first[:, :-1].flatten(), first[:, 1:].flatten()
@@ -106,10 +106,10 @@ def main() -> None:
     for discovered in DISCOVERED:
         td = observation((options.batch,), N_AGENTS, N_SLOTS, sensed=SENSED, discovered=1.0)
         beyond = torch.arange(N_SLOTS) >= discovered
-        td[keys.SLOT_ACTIVE][:, beyond] = False
-        td[keys.SLOT_DESCRIPTOR][:, beyond] = 0.0
-        td[keys.EDGE][..., beyond] = False
-        edges = int(td[keys.EDGE].sum())
+        td[entries.SLOT_ACTIVE][:, beyond] = False
+        td[entries.SLOT_DESCRIPTOR][:, beyond] = 0.0
+        td[entries.EDGE][..., beyond] = False
+        edges = int(td[entries.EDGE].sum())
         base = None
         for name, encoder in encoders.items():
 

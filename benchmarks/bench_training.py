@@ -20,7 +20,7 @@ from torchrl.envs.utils import ExplorationType
 from softgm_bench.algorithms import build_algorithm
 from softgm_bench.config import compose
 from softgm_bench.envs import make_env
-from softgm_bench.runs.loop import keep_memory, set_threads
+from softgm_bench.runs.machine import keep_memory, set_threads
 
 ALGORITHMS = ("softgm", "ippo", "mappo", "iddpg", "maddpg", "isac", "masac")
 OFF_POLICY = ("iddpg", "maddpg", "isac", "masac")

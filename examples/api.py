@@ -6,7 +6,7 @@ from pathlib import Path
 from torchrl.envs.utils import step_mdp
 
 from softgm_bench import api
-from softgm_bench.envs import keys
+from softgm_bench.envs import entries
 
 
 def main() -> None:
@@ -16,7 +16,7 @@ def main() -> None:
     # Four arms in front of walls, moved by uniform actions.
     env = api.make_env("task=wall", num_envs=4, seed=0)
     frames = api.rollout(env, steps=20)
-    print(f"reward of the first steps: {frames['next', keys.REWARD][0, :3].flatten().tolist()}")
+    print(f"reward of the first steps: {frames['next', entries.REWARD][0, :3].flatten().tolist()}")
 
     # A training of seconds, which teaches nothing; without experiment=smoke it takes as long as the command does.
     run = api.train("algo=softgm", "task=basic", "experiment=smoke", f"run_dir={folder}", "overwrite=true")
@@ -30,9 +30,9 @@ def main() -> None:
     env = api.make_env("task=basic", num_envs=2, seed=0)
     observation, policy = env.reset(), api.load(run.folder)
     for _ in range(10):
-        observation[keys.ACTION] = api.act(policy, observation)
+        observation[entries.ACTION] = api.act(policy, observation)
         observation = step_mdp(env.step(observation))
-    print(f"where the tips are now, m: {observation[keys.TIP].tolist()}")
+    print(f"where the tips are now, m: {observation[entries.TIP].tolist()}")
 
     # One episode as arrays.
     episode = api.record(run.folder, seed=0, horizon=25)

@@ -23,8 +23,8 @@ from softgm_bench.assembly import build_env
 from softgm_bench.episodes import policy, trajectory
 from softgm_bench.episodes.evaluation import evaluate_in_parts
 from softgm_bench.episodes.replay import compare, replay
-from softgm_bench.episodes.summary import versions
-from softgm_bench.runs.folder import to_json
+from softgm_bench.storage.versions import versions
+from softgm_bench.storage.files import to_json
 
 ROOT = Path(__file__).parents[1]
 

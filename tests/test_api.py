@@ -10,7 +10,7 @@ from torchrl.envs.utils import step_mdp
 
 from softgm_bench import api
 from softgm_bench.config import UserError
-from softgm_bench.envs import keys
+from softgm_bench.envs import entries
 
 ROOT = Path(__file__).parents[1]
 TINY = (
@@ -54,11 +54,11 @@ def test_a_rollout_of_a_policy_repeats_what_acting_step_by_step_does(run):
     observation = env.reset()
     for step in range(4):
         action = api.act(trained, observation)
-        assert torch.equal(action, frames[keys.ACTION][:, step])
-        observation[keys.ACTION] = action
+        assert torch.equal(action, frames[entries.ACTION][:, step])
+        observation[entries.ACTION] = action
         observation = step_mdp(env.step(observation))
     assert frames.shape == (3, 4)
-    assert torch.equal(observation[keys.TIP], frames["next", keys.TIP][:, -1])
+    assert torch.equal(observation[entries.TIP], frames["next", entries.TIP][:, -1])
 
 
 def test_acting_leaves_the_observation_as_it_is_and_samples_if_asked_to(run):

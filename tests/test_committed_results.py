@@ -6,7 +6,7 @@ import pytest
 import torch
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from softgm_bench.envs import keys, make_env
+from softgm_bench.envs import entries, make_env
 from softgm_bench.episodes import policy
 
 ROOT = Path(__file__).parents[1]
@@ -57,4 +57,4 @@ def test_a_kept_policy_still_reaches_targets(algo):
     env = make_env(trained.config.task, trained.config.rod, num_envs=64, seed=3, horizon=100)
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         episodes = env.rollout(100, trained.policy, break_when_any_done=False)
-    assert episodes["next"][keys.SUCCESS].any(dim=1).double().mean() > 0.85
+    assert episodes["next"][entries.SUCCESS].any(dim=1).double().mean() > 0.85

@@ -79,7 +79,7 @@ def test_the_commands_of_the_tutorial_do_what_it_says(place):
 CHECKS = """
 import torch
 from softgm_bench import api
-from softgm_bench.envs import keys
+from softgm_bench.envs import entries
 
 env = api.make_env("task=one_post", num_envs=64, seed=3)
 td = env.reset()
@@ -96,36 +96,36 @@ algorithm = api.build_algorithm(config, env)
 
 # the embedding does not depend on the order of the slots, and does on what is in them
 td = env.reset()
-edge, slots = td[keys.EDGE].clone(), td[keys.SLOT_DESCRIPTOR].clone()
+edge, slots = td[entries.EDGE].clone(), td[entries.SLOT_DESCRIPTOR].clone()
 edge[:, 0, :4] = True
-td[keys.EDGE], td[keys.SLOT_ACTIVE] = edge, edge.any(1)
-td[keys.SLOT_DESCRIPTOR] = torch.randn_like(slots)
+td[entries.EDGE], td[entries.SLOT_ACTIVE] = edge, edge.any(1)
+td[entries.SLOT_DESCRIPTOR] = torch.randn_like(slots)
 encoder = algorithm.policy[0].head.encoder
 shuffled, emptied = td.clone(), td.clone()
 order = torch.randperm(edge.shape[-1])
-shuffled[keys.EDGE] = td[keys.EDGE][..., order]
-shuffled[keys.SLOT_ACTIVE] = td[keys.SLOT_ACTIVE][..., order]
-shuffled[keys.SLOT_DESCRIPTOR] = td[keys.SLOT_DESCRIPTOR][:, order]
-emptied[keys.EDGE] = torch.zeros_like(edge)
+shuffled[entries.EDGE] = td[entries.EDGE][..., order]
+shuffled[entries.SLOT_ACTIVE] = td[entries.SLOT_ACTIVE][..., order]
+shuffled[entries.SLOT_DESCRIPTOR] = td[entries.SLOT_DESCRIPTOR][:, order]
+emptied[entries.EDGE] = torch.zeros_like(edge)
 assert torch.allclose(encoder(td), encoder(shuffled), atol=1e-5)
 assert not torch.allclose(encoder(td)[:, 0], encoder(emptied)[:, 0], atol=1e-3)
 assert torch.equal(encoder(td)[:, 1], encoder(emptied)[:, 1])
 
 # returns end with the episode; an action that was rewarded becomes likelier, one that was punished less likely
 batch = api.rollout(env, algorithm.policy, steps=3, deterministic=False)
-batch["next", keys.REWARD] = torch.tensor([1.0, 2.0, 4.0]).expand(8, 3).unsqueeze(-1).clone()
+batch["next", entries.REWARD] = torch.tensor([1.0, 2.0, 4.0]).expand(8, 3).unsqueeze(-1).clone()
 done = torch.zeros(8, 3, 1, dtype=torch.bool)
 done[4:, 1] = True
-batch["next", keys.DONE] = done
+batch["next", entries.DONE] = done
 g = algorithm.config.gamma
 returns = algorithm.returns(batch)
 assert torch.allclose(returns[0], torch.tensor([1 + 2 * g + 4 * g * g, 2 + 4 * g, 4.0]))
 assert torch.allclose(returns[7], torch.tensor([1 + 2 * g, 2.0, 4.0]))
 good = torch.arange(8) < 4
-batch["next", keys.REWARD] = torch.where(good, 1.0, -1.0).reshape(8, 1, 1).expand(8, 3, 1).clone()
+batch["next", entries.REWARD] = torch.where(good, 1.0, -1.0).reshape(8, 1, 1).expand(8, 3, 1).clone()
 def likelihood():
     with torch.no_grad():
-        return algorithm.policy.get_dist(batch).log_prob(batch[keys.ACTION]).sum(dim=(-1, -2))
+        return algorithm.policy.get_dist(batch).log_prob(batch[entries.ACTION]).sum(dim=(-1, -2))
 before = likelihood()
 for _ in range(5):
     algorithm.update(batch)

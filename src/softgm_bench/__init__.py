@@ -1,16 +1,29 @@
-"""Reference benchmark for distributed control of soft robotic arms."""
+"""Reference benchmark for distributed control of soft robotic arms.
 
-import os
+What most users need is here and loaded when it is first asked for, because torch takes seconds; the rest of the Python
+interface is ``softgm_bench.api``.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from softgm_bench.api import evaluate, load, make_env, train
+    from softgm_bench.envs import SoftArmEnv
 
 __version__ = "0.1.0"
+__all__ = ["SoftArmEnv", "__version__", "evaluate", "load", "make_env", "train"]
 
-# Idle OpenMP threads of torch spin for milliseconds by default, which slows processes that share cores (a sweep, an
-# evaluation beside a training) tens of times; sleeping at once halves the speed of a process that is alone. Spinning
-# for microseconds loses neither. It counts only if set before torch is loaded.
-if "OMP_WAIT_POLICY" not in os.environ:
-    os.environ.setdefault("GOMP_SPINCOUNT", "2000")
+_HOMES = {"SoftArmEnv": "envs"} | dict.fromkeys(("evaluate", "load", "make_env", "train"), "api")
 
-# oneDNN multiplies float32 matrices twice as fast as MKL on AMD's cores (the training loop chooses it), through a
-# setting that would let it round them to bfloat16 where the CPU has instructions for that; this forbids it. It counts
-# only if set before the first product.
-os.environ.setdefault("ONEDNN_MAX_CPU_ISA", "AVX512_CORE")
+
+def __getattr__(name: str) -> Any:
+    """Load what is listed in ``__all__`` from its home."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    """List what can be asked for."""
+    return sorted({*globals(), *__all__})

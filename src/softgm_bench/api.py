@@ -12,16 +12,16 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from softgm_bench import algorithms, plugins
+from softgm_bench import assembly, plugins
 from softgm_bench.algorithms import Algorithm
 from softgm_bench.assembly import build_env
 from softgm_bench.config import Config, compose
-from softgm_bench.envs import SoftArmEnv, keys
-from softgm_bench.envs.vmas import VmasEnv
+from softgm_bench.envs import entries
 from softgm_bench.episodes import folder as evaluation_folder
-from softgm_bench.episodes import policy, trajectory
+from softgm_bench.episodes import policy, recording
 from softgm_bench.episodes.evaluation import DISCOUNT, EpisodeRecords, evaluate_in_parts
 from softgm_bench.episodes.policy import TrainedPolicy
 from softgm_bench.episodes.summary import summarise, table
@@ -68,7 +68,7 @@ def configure(*overrides: str) -> Config:
     return compose(list(overrides))
 
 
-def make_env(*overrides: str, num_envs: int = 1, seed: int = 0, horizon: int | None = None) -> SoftArmEnv | VmasEnv:
+def make_env(*overrides: str, num_envs: int = 1, seed: int = 0, horizon: int | None = None) -> EnvBase:
     """A TorchRL environment of ``num_envs`` arms, as evaluations use it.
 
     Args:
@@ -80,12 +80,9 @@ def make_env(*overrides: str, num_envs: int = 1, seed: int = 0, horizon: int | N
     return build_env(configure(*overrides), num_envs, seed, horizon)
 
 
-def build_algorithm(config: Config, env: SoftArmEnv | VmasEnv) -> Algorithm:
+def build_algorithm(config: Config, env: EnvBase) -> Algorithm:
     """The algorithm that the settings mean, with fresh networks for ``env``: for a training loop of your own."""
-    try:
-        return algorithms.build_algorithm(config.algo, config.model, env, config.oracle)
-    except ValueError as error:
-        raise UserError(str(error)) from error
+    return assembly.build_algorithm(config, env)
 
 
 def train(*overrides: str) -> TrainedRun:
@@ -111,11 +108,11 @@ def act(
     """Actions ``(num_envs, N, 2)`` in [-1, 1] for what ``env.reset()`` or ``step_mdp(env.step(...))`` gave."""
     module = trained.policy if isinstance(trained, TrainedPolicy) else trained
     with torch.no_grad(), set_exploration_type(_exploration(deterministic)):
-        return module(observation.select(*module.in_keys))[keys.ACTION]
+        return module(observation.select(*module.in_keys))[entries.ACTION]
 
 
 def rollout(
-    env: SoftArmEnv | VmasEnv,
+    env: EnvBase,
     trained: TrainedPolicy | TensorDictModuleBase | None = None,
     steps: int = 100,
     deterministic: bool = True,
@@ -192,8 +189,8 @@ def record(
     deterministic: bool = True,
     attention: bool = False,
 ) -> Trajectory:
-    """One episode of an evaluation as arrays, for ``trajectory.save`` and for drawing; see ``trajectory.record``."""
-    return trajectory.record(_loaded(source, overrides), seed, episode, horizon, deterministic, attention)
+    """One episode of an evaluation as arrays, for ``trajectory.save`` and for drawing; see ``recording.record``."""
+    return recording.record(_loaded(source, overrides), seed, episode, horizon, deterministic, attention)
 
 
 def _loaded(source: Source, overrides: tuple[str, ...]) -> TrainedPolicy:

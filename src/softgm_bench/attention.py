@@ -71,7 +71,8 @@ def _attention(arguments: list[str]) -> None:
 
 
 def _episode(source: Path, options: Options, overrides: list[str]) -> "Trajectory":
-    from softgm_bench.episodes.trajectory import load, record  # late: a refused command is quick
+    from softgm_bench.episodes.recording import record  # late: a refused command is quick
+    from softgm_bench.episodes.trajectory import load
 
     if source.suffix == ".npz":
         if overrides:
@@ -81,7 +82,7 @@ def _episode(source: Path, options: Options, overrides: list[str]) -> "Trajector
         raise UserError(f"threads={options.threads}: choose 1 to {available_threads()}, the cores here, or null")
     from softgm_bench.episodes import policy
     from softgm_bench.episodes.recording import attention_encoder
-    from softgm_bench.runs.loop import set_threads
+    from softgm_bench.runs.machine import set_threads
 
     trained = policy.load(source, overrides=overrides)
     if attention_encoder(trained.policy) is None:
@@ -113,7 +114,7 @@ def _write(trajectory: "Trajectory", steps: list[int] | None, folder: Path) -> l
     import numpy as np
 
     from softgm_bench.analysis import attention
-    from softgm_bench.runs.folder import write_atomically
+    from softgm_bench.storage.files import write_atomically
 
     chosen = attention.busiest_steps(trajectory) if steps is None else steps
     for step in chosen:

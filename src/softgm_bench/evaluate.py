@@ -82,7 +82,7 @@ def _evaluate(arguments: list[str]) -> None:
     from softgm_bench.episodes import policy
     from softgm_bench.episodes.evaluation import evaluate_in_parts
     from softgm_bench.episodes.summary import table
-    from softgm_bench.runs.loop import keep_memory, set_threads
+    from softgm_bench.runs.machine import keep_memory, set_threads
 
     trained = policy.load(source, options.device, overrides)
     unusual = {"horizon": options.horizon, "sampled": not options.deterministic}

@@ -83,7 +83,7 @@ def report(recorded: "Trajectory", replayed: "Replay", result: dict[str, Any], o
 
 
 def _write(path: Path, recorded: "Trajectory", replayed: "Replay", result: dict[str, Any], options: Options) -> None:
-    from softgm_bench.runs.folder import to_json, write_atomically
+    from softgm_bench.storage.files import to_json, write_atomically
 
     forces = None if replayed.contact_force is None else replayed.contact_force.tolist()
     about = {"info": recorded.info, "backend": options.backend, "pruning": options.pruning}

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from softgm_bench.command import parse, run
 from softgm_bench.config import UserError
-from softgm_bench.runs.folder import to_json, write_atomically
+from softgm_bench.storage.files import to_json, write_atomically
 
 
 @dataclass

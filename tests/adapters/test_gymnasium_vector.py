@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from softgm_bench.config import UserError
-from softgm_bench.envs import keys, make_env
+from softgm_bench.envs import entries, make_env
 
 pytest.importorskip("gymnasium", reason="an optional extra: pip install 'softgm-bench[pettingzoo]'")
 
@@ -28,7 +28,7 @@ def actions_for(env, steps):
 
 
 def joint(td):
-    return np.concatenate([td[key].numpy().reshape(td.batch_size[0], -1) for key in keys.OBSERVATION], axis=1)
+    return np.concatenate([td[key].numpy().reshape(td.batch_size[0], -1) for key in entries.OBSERVATION], axis=1)
 
 
 def column(td, *key):
@@ -47,12 +47,12 @@ def test_a_rollout_is_soft_arm_env_s(settings, task, horizon, overrides):
     ends = []
     for action in actions_for(env, 30):
         assert np.array_equal(observation, joint(td))
-        assert np.array_equal(infos["distance"], column(td, *keys.DISTANCE))
-        last = peer.step(td.set(keys.ACTION, torch.from_numpy(action).reshape(ENVS, -1, 2)))["next"]
+        assert np.array_equal(infos["distance"], column(td, *entries.DISTANCE))
+        last = peer.step(td.set(entries.ACTION, torch.from_numpy(action).reshape(ENVS, -1, 2)))["next"]
         observation, reward, terminated, truncated, infos = env.step(action)
-        assert np.array_equal(reward, column(last, keys.REWARD))
-        assert np.array_equal(terminated, column(last, keys.TERMINATED))
-        assert np.array_equal(truncated, column(last, keys.TRUNCATED))
+        assert np.array_equal(reward, column(last, entries.REWARD))
+        assert np.array_equal(terminated, column(last, entries.TERMINATED))
+        assert np.array_equal(truncated, column(last, entries.TRUNCATED))
         done = terminated | truncated
         ends.append(done)
         td = last
@@ -61,7 +61,7 @@ def test_a_rollout_is_soft_arm_env_s(settings, task, horizon, overrides):
             assert all(row is None for row in infos["final_obs"][~done])
             assert np.array_equal(infos["_final_obs"], done)
             success = infos["final_info"]["success"]
-            assert np.array_equal(success, column(last, *keys.SUCCESS) & done)
+            assert np.array_equal(success, column(last, *entries.SUCCESS) & done)
             td = peer.reset(last.clone().set("_reset", torch.from_numpy(done).unsqueeze(-1)))
         else:
             assert "final_obs" not in infos

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from softgm_bench.config import UserError
-from softgm_bench.envs import keys, make_env
+from softgm_bench.envs import entries, make_env
 from softgm_bench.models.graph import flat_features, flat_observation
 
 pytest.importorskip("pettingzoo", reason="PettingZoo is an optional extra: pip install 'softgm-bench[pettingzoo]'")
@@ -92,19 +92,19 @@ def test_steps_are_those_of_soft_arm_env_over_ends_and_resets(reference, case):
     ends, sensed = 0, False
     for action in random_actions(env, 30):
         assert same(observation, td)
-        sensed |= bool(td[keys.EDGE].any())
-        td.set(keys.ACTION, torch.from_numpy(action).unsqueeze(0))
+        sensed |= bool(td[entries.EDGE].any())
+        td.set(entries.ACTION, torch.from_numpy(action).unsqueeze(0))
         td = peer.step(td)["next"]
         observation, rewards, terminated, truncated, infos = env.step(by_agent(env, action))
-        assert set(rewards.values()) == {td[keys.REWARD].item()}
-        assert set(terminated.values()) == {td[keys.TERMINATED].item()}
-        assert set(truncated.values()) == {td[keys.TRUNCATED].item()}
+        assert set(rewards.values()) == {td[entries.REWARD].item()}
+        assert set(terminated.values()) == {td[entries.TERMINATED].item()}
+        assert set(truncated.values()) == {td[entries.TRUNCATED].item()}
         for info in infos.values():
             for name in ("success", "diverged", "distance", "contact_nodes"):
                 assert info[name] == td["info", name].item()
-            for name in keys.REWARD_TERM_NAMES:
+            for name in entries.REWARD_TERM_NAMES:
                 assert info[f"reward_{name}"] == td["reward_terms", name].item()
-        if td[keys.DONE].item():
+        if td[entries.DONE].item():
             ends += 1
             assert env.agents == []
             assert same(observation, td)  # of the last state
@@ -180,18 +180,26 @@ def test_the_dict_holds_each_agent_s_own_rows_and_the_state_everything(reference
     env.reset()
     td = peer.reset()
     for action in random_actions(env, 12):
-        td = peer.step(td.set(keys.ACTION, torch.from_numpy(action).unsqueeze(0)))["next"]
+        td = peer.step(td.set(entries.ACTION, torch.from_numpy(action).unsqueeze(0)))["next"]
         observation = env.step(by_agent(env, action))[0]
-    assert td[keys.EDGE].any()
-    assert not torch.equal(td[keys.EDGE][0, 0], td[keys.EDGE][0, -1])
+    assert td[entries.EDGE].any()
+    assert not torch.equal(td[entries.EDGE][0, 0], td[entries.EDGE][0, -1])
     for row, agent in enumerate(env.possible_agents):
-        for name, key in (("position", keys.AGENT_POSITION), ("velocity", keys.AGENT_VELOCITY), ("edge", keys.EDGE)):
+        for name, key in (
+            ("position", entries.AGENT_POSITION),
+            ("velocity", entries.AGENT_VELOCITY),
+            ("edge", entries.EDGE),
+        ):
             assert np.array_equal(observation[agent][name], td[key][0, row].numpy())
         assert np.array_equal(observation[agent]["previous_action"], action[row])
-        for name, key in (("slot_descriptor", keys.SLOT_DESCRIPTOR), ("tip", keys.TIP), ("target", keys.TARGET)):
+        for name, key in (
+            ("slot_descriptor", entries.SLOT_DESCRIPTOR),
+            ("tip", entries.TIP),
+            ("target", entries.TARGET),
+        ):
             assert np.array_equal(observation[agent][name], td[key][0].numpy())
     state = env.state()
-    assert np.array_equal(state, np.concatenate([td[key].numpy().ravel() for key in keys.OBSERVATION]))
+    assert np.array_equal(state, np.concatenate([td[key].numpy().ravel() for key in entries.OBSERVATION]))
 
 
 def test_changing_an_observation_changes_nothing_else():

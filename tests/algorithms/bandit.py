@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from softgm_bench.envs import keys
+from softgm_bench.envs import entries
 
 NUM_ENVS, N_AGENTS, N_SLOTS = 32, 2, 2
 SIZES = SimpleNamespace(
@@ -32,14 +32,14 @@ def observation():
     """Random targets, all else at rest, ``(NUM_ENVS,)``."""
     lead = (NUM_ENVS,)
     entries = {
-        keys.AGENT_POSITION: torch.zeros(*lead, N_AGENTS, 3),
-        keys.AGENT_VELOCITY: torch.zeros(*lead, N_AGENTS, 3),
-        keys.PREVIOUS_ACTION: torch.zeros(*lead, N_AGENTS, 2),
-        keys.EDGE: torch.zeros(*lead, N_AGENTS, N_SLOTS, dtype=torch.bool),
-        keys.SLOT_DESCRIPTOR: torch.zeros(*lead, N_SLOTS, 9),
-        keys.SLOT_ACTIVE: torch.zeros(*lead, N_SLOTS, dtype=torch.bool),
-        keys.TIP: torch.zeros(*lead, 3),
-        keys.TARGET: torch.rand(*lead, 3) * 1.4 - 0.7,
+        entries.AGENT_POSITION: torch.zeros(*lead, N_AGENTS, 3),
+        entries.AGENT_VELOCITY: torch.zeros(*lead, N_AGENTS, 3),
+        entries.PREVIOUS_ACTION: torch.zeros(*lead, N_AGENTS, 2),
+        entries.EDGE: torch.zeros(*lead, N_AGENTS, N_SLOTS, dtype=torch.bool),
+        entries.SLOT_DESCRIPTOR: torch.zeros(*lead, N_SLOTS, 9),
+        entries.SLOT_ACTIVE: torch.zeros(*lead, N_SLOTS, dtype=torch.bool),
+        entries.TIP: torch.zeros(*lead, 3),
+        entries.TARGET: torch.rand(*lead, 3) * 1.4 - 0.7,
     }
     td = TensorDict({}, lead)
     for key, value in entries.items():
@@ -53,9 +53,9 @@ def act(policy, exploration):
     after = frame.clone()
     with torch.no_grad(), set_exploration_type(exploration):
         policy(frame)
-    error = (frame[keys.ACTION] - frame[keys.TARGET][:, None, :2]).square().mean(dim=(-2, -1))
+    error = (frame[entries.ACTION] - frame[entries.TARGET][:, None, :2]).square().mean(dim=(-2, -1))
     ended = torch.ones(NUM_ENVS, 1, dtype=torch.bool)
-    after.update({keys.REWARD: -error.unsqueeze(-1), keys.DONE: ended, keys.TERMINATED: ended})
+    after.update({entries.REWARD: -error.unsqueeze(-1), entries.DONE: ended, entries.TERMINATED: ended})
     frame["next"] = after
     return frame.unsqueeze(1), error.mean().item()
 

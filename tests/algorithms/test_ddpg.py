@@ -8,7 +8,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from softgm_bench.algorithms.ddpg import DDPG, DDPGConfig
 from softgm_bench.algorithms.off_policy import AGENT_REWARD
-from softgm_bench.envs import keys, make_env
+from softgm_bench.envs import entries, make_env
 from softgm_bench.models.action_value import ACTION_VALUE
 from softgm_bench.models.mlp import MLPConfig
 
@@ -60,32 +60,32 @@ def test_the_actors_loss_asks_for_the_current_actions_of_all_agents(build, name)
     critic = algorithm.loss.value_network
     with torch.no_grad(), algorithm.loss.value_network_params.to_module(critic):
         current = algorithm.policy.actor(transitions.copy())
-        assert not torch.equal(current[keys.ACTION], transitions[keys.ACTION])
+        assert not torch.equal(current[entries.ACTION], transitions[entries.ACTION])
         expected = -critic(current)[ACTION_VALUE].mean()
     assert algorithm.loss(transitions)["loss_actor"].item() == pytest.approx(expected.item(), rel=1e-5)
 
 
 def test_the_teams_reward_is_every_agents(build):
     transitions = filled(*build()).sample()
-    assert transitions["next", keys.REWARD].shape == (16, 1)
+    assert transitions["next", entries.REWARD].shape == (16, 1)
     assert transitions["next", AGENT_REWARD].shape == (16, 6, 1)
-    assert (transitions["next", AGENT_REWARD] == transitions["next", keys.REWARD].unsqueeze(1)).all()
-    assert transitions["next", keys.REWARD].unique().numel() > 5
+    assert (transitions["next", AGENT_REWARD] == transitions["next", entries.REWARD].unsqueeze(1)).all()
+    assert transitions["next", entries.REWARD].unique().numel() > 5
 
 
 def observe(env):
-    return env.reset().select(*keys.OBSERVATION)
+    return env.reset().select(*entries.OBSERVATION)
 
 
 def actions(policy, td, exploration, count=1):
     with torch.no_grad(), set_exploration_type(exploration):
-        return torch.stack([policy(td.clone())[keys.ACTION] for _ in range(count)])
+        return torch.stack([policy(td.clone())[entries.ACTION] for _ in range(count)])
 
 
 def test_noise_is_added_only_while_exploring_and_has_the_scheduled_sigma(build):
     algorithm, env = build("iddpg", "algo.initial_sigma=0.4", "algo.final_sigma=0.1", "algo.sigma_frames=64")
     td, policy = observe(env), algorithm.policy
-    mean = policy.actor(td.clone())[keys.ACTION]
+    mean = policy.actor(td.clone())[entries.ACTION]
     assert mean.abs().max() < 0.1
     for exploration in (ExplorationType.DETERMINISTIC, ExplorationType.MEAN):
         assert torch.equal(actions(policy, td, exploration)[0], mean)
@@ -95,7 +95,7 @@ def test_noise_is_added_only_while_exploring_and_has_the_scheduled_sigma(build):
     for batch, sigma in zip(batches(algorithm, env, count=3), (0.25, 0.1, 0.1), strict=True):
         algorithm.update(batch)
         assert policy.sigma == pytest.approx(sigma)
-    assert torch.equal(actions(policy, td, ExplorationType.DETERMINISTIC)[0], policy.actor(td.clone())[keys.ACTION])
+    assert torch.equal(actions(policy, td, ExplorationType.DETERMINISTIC)[0], policy.actor(td.clone())[entries.ACTION])
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.8])
@@ -106,7 +106,7 @@ def test_noise_has_the_same_sigma_whatever_its_correlation(build, correlation):
     torch.manual_seed(0)
     for _ in range(600):
         taken.append(actions(algorithm.policy, td, ExplorationType.RANDOM)[0])
-        td[keys.PREVIOUS_ACTION] = taken[-1]
+        td[entries.PREVIOUS_ACTION] = taken[-1]
     noise = torch.stack(taken)[20:]
     assert noise.std().item() == pytest.approx(0.2, rel=0.05)
     lag_one = (noise[1:] * noise[:-1]).mean() / noise.square().mean()
@@ -121,7 +121,7 @@ def test_actions_are_uniform_and_nothing_is_learnt_during_the_random_frames(buil
         metrics = algorithm.update(batch)
         changed = any(not torch.equal(*pair) for pair in zip(before, algorithm.loss.parameters(), strict=True))
         assert changed == (metrics["gradient_steps"] > 0)
-        seen.append((metrics["gradient_steps"], batch[keys.ACTION].std().item()))
+        seen.append((metrics["gradient_steps"], batch[entries.ACTION].std().item()))
     assert [steps for steps, _ in seen] == [0.0, 3.0, 3.0]
     assert [spread for _, spread in seen[:2]] == pytest.approx([3**-0.5] * 2, rel=0.1)
     assert seen[2][1] < 0.1
@@ -139,7 +139,7 @@ def test_an_update_moves_actor_critic_and_target_on_every_model(build, name, mod
     algorithm, env = build(name, f"model={model}", "model.hidden=16", "task.sensing_radius=0.4", task="wall")
     loss = algorithm.loss
     (batch,) = batches(algorithm, env)
-    assert batch[keys.EDGE].any()
+    assert batch[entries.EDGE].any()
     groups = [loss.actor_network_params, loss.value_network_params, loss.target_value_network_params]
     before = [group.clone() for group in groups]
     metrics = algorithm.update(batch)
@@ -195,9 +195,9 @@ def test_privileged_numbers_reach_the_critic_that_asks_for_them_and_the_actor_of
     if oracle:
         config = settings("task=wall", "algo=maddpg", *SMALL)
         algorithm = DDPG(config.algo, config.model, env, oracle=True)
-    assert (keys.PRIVILEGED in algorithm.policy.in_keys) == oracle
+    assert (entries.PRIVILEGED in algorithm.policy.in_keys) == oracle
     filled(algorithm, env)
     transitions = algorithm.sample()
-    assert transitions[keys.PRIVILEGED].shape == transitions["next", keys.PRIVILEGED].shape == (16, 4)
-    assert transitions[keys.PRIVILEGED].unique(dim=0).shape[0] > 1
+    assert transitions[entries.PRIVILEGED].shape == transitions["next", entries.PRIVILEGED].shape == (16, 4)
+    assert transitions[entries.PRIVILEGED].unique(dim=0).shape[0] > 1
     assert algorithm.loss(transitions)["loss_value"].isfinite()

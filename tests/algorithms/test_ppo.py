@@ -6,7 +6,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from round_trips import RoundTrips
 from softgm_bench.algorithms.ppo import ADVANTAGE, PPO, VALUE_TARGET
-from softgm_bench.envs import keys, make_env
+from softgm_bench.envs import entries, make_env
 from softgm_bench.models.heads import STATE_VALUE
 from softgm_bench.rod.parameters import RodParameters
 
@@ -129,10 +129,10 @@ def test_clipping_takes_the_smaller_gain_of_each_agent(build):
     """Ratios 1.5 and 0.5 with advantages of either sign: min(r A, clip(r, 0.8, 1.2) A), by hand."""
     algorithm, env = build("basic", "algo.entropy_coeff=0.0")
     frames = algorithm.prepare(collect(algorithm, env))[:2]
-    log_prob = frames[keys.LOG_PROB]
+    log_prob = frames[entries.LOG_PROB]
     shift = torch.full_like(log_prob, -torch.tensor(1.5).log().item())
     shift[1] = -torch.tensor(0.5).log().item()
-    frames[keys.LOG_PROB] = log_prob + shift
+    frames[entries.LOG_PROB] = log_prob + shift
     for advantages, gains in (((1.0, 1.0), (1.2, 0.5)), ((-1.0, -1.0), (-1.5, -0.8))):
         frames[ADVANTAGE] = torch.tensor(advantages).view(2, 1, 1).expand(2, 6, 1)
         loss = algorithm.loss(frames)["loss_objective"]
@@ -210,7 +210,7 @@ def test_learning_rates_fall_linearly_with_the_frames_learnt_from(build):
 
 def told_otherwise(frames):
     changed = frames.clone()
-    changed[keys.PRIVILEGED] = frames[keys.PRIVILEGED] + 1.0
+    changed[entries.PRIVILEGED] = frames[entries.PRIVILEGED] + 1.0
     return changed
 
 
@@ -221,18 +221,18 @@ def test_an_asymmetric_critic_is_told_what_the_actor_is_not(build, name):
     other = told_otherwise(frames)
     assert not torch.isclose(algorithm._values(frames), algorithm._values(other)).any()
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        assert torch.equal(algorithm.policy(frames.clone())[keys.ACTION], algorithm.policy(other)[keys.ACTION])
-    assert keys.PRIVILEGED not in algorithm.policy.in_keys
+        assert torch.equal(algorithm.policy(frames.clone())[entries.ACTION], algorithm.policy(other)[entries.ACTION])
+    assert entries.PRIVILEGED not in algorithm.policy.in_keys
     algorithm.update(collect(algorithm, env))
 
 
 @NAMES
 def test_without_it_neither_actor_nor_critic_reads_what_is_privileged(build, name):
     algorithm, env = build("wall", f"algo={name}")
-    assert set(algorithm.policy.in_keys) == set(algorithm.critic.in_keys) == set(keys.OBSERVATION)
-    frames = collect(algorithm, env).select(*keys.OBSERVATION)
+    assert set(algorithm.policy.in_keys) == set(algorithm.critic.in_keys) == set(entries.OBSERVATION)
+    frames = collect(algorithm, env).select(*entries.OBSERVATION)
     assert algorithm._values(frames).isfinite().all()
-    assert algorithm.policy(frames)[keys.ACTION].isfinite().all()
+    assert algorithm.policy(frames)[entries.ACTION].isfinite().all()
 
 
 @NAMES
@@ -241,7 +241,7 @@ def test_an_oracle_is_told_and_learns_from_it(build, name):
     batch = collect(algorithm, env)
     other = told_otherwise(batch)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        assert not torch.equal(algorithm.policy(batch.clone())[keys.ACTION], algorithm.policy(other)[keys.ACTION])
+        assert not torch.equal(algorithm.policy(batch.clone())[entries.ACTION], algorithm.policy(other)[entries.ACTION])
     losses = algorithm.loss(algorithm.prepare(batch))
     assert losses["max_ratio"] == pytest.approx(1.0, abs=1e-5)
     algorithm.update(batch)
@@ -281,7 +281,7 @@ def test_without_an_entropy_bonus_the_entropy_is_that_of_the_frames_and_gradient
     algorithm, env = build("basic", "algo.entropy_coeff=0.0")
     batch = collect(algorithm, env)
     reported = algorithm.update(batch)
-    assert reported["entropy"] == pytest.approx(-float(batch[keys.LOG_PROB].mean()), rel=1e-6)
+    assert reported["entropy"] == pytest.approx(-float(batch[entries.LOG_PROB].mean()), rel=1e-6)
     assert reported["loss_entropy"] == 0.0
     frames = algorithm.prepare(batch)
     gradients = []

@@ -7,13 +7,13 @@ from tensordict import TensorDict
 from torchrl.collectors import Collector
 
 from softgm_bench.algorithms.replay import FRAMES_PER_EPISODE, Replay
-from softgm_bench.envs import keys, make_env
+from softgm_bench.envs import entries, make_env
 from softgm_bench.rod.parameters import RodParameters
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-SAMPLED = (*keys.OBSERVATION, keys.ACTION)
-SAMPLED_NEXT = (*keys.OBSERVATION, keys.REWARD, keys.DONE, keys.TERMINATED)
+SAMPLED = (*entries.OBSERVATION, entries.ACTION)
+SAMPLED_NEXT = (*entries.OBSERVATION, entries.REWARD, entries.DONE, entries.TERMINATED)
 
 
 class Stream:
@@ -40,29 +40,29 @@ class Stream:
         self.count = min(n_slots, self.count + int(torch.randint(3, (), generator=self.random)))
         active = torch.arange(n_slots) < self.count
         td = TensorDict({}, [])
-        td[keys.AGENT_POSITION] = torch.randn(n_agents, 3, generator=self.random)
-        td[keys.AGENT_VELOCITY] = torch.randn(n_agents, 3, generator=self.random)
-        td[keys.PREVIOUS_ACTION] = torch.randn(n_agents, 2, generator=self.random)
-        td[keys.EDGE] = (torch.rand(n_agents, n_slots, generator=self.random) < 0.5) & active
-        td[keys.SLOT_DESCRIPTOR] = self.table * active.unsqueeze(-1)
-        td[keys.SLOT_ACTIVE] = active
-        td[keys.TIP] = torch.randn(3, generator=self.random)
-        td[keys.TARGET] = torch.randn(3, generator=self.random)
+        td[entries.AGENT_POSITION] = torch.randn(n_agents, 3, generator=self.random)
+        td[entries.AGENT_VELOCITY] = torch.randn(n_agents, 3, generator=self.random)
+        td[entries.PREVIOUS_ACTION] = torch.randn(n_agents, 2, generator=self.random)
+        td[entries.EDGE] = (torch.rand(n_agents, n_slots, generator=self.random) < 0.5) & active
+        td[entries.SLOT_DESCRIPTOR] = self.table * active.unsqueeze(-1)
+        td[entries.SLOT_ACTIVE] = active
+        td[entries.TIP] = torch.randn(3, generator=self.random)
+        td[entries.TARGET] = torch.randn(3, generator=self.random)
         return td
 
     def step(self):
         frame = self.now.clone()
-        frame[keys.ACTION] = torch.randn(self.sizes[0], 2, generator=self.random)
+        frame[entries.ACTION] = torch.randn(self.sizes[0], 2, generator=self.random)
         after = self.observe()
         terminated, truncated = (torch.rand(2, 1, generator=self.random) < self.ends).unbind(0)
         self.now = after.clone()
-        after[keys.REWARD] = torch.tensor([float(self.number)])
-        after[keys.TERMINATED], after[keys.DONE] = terminated, terminated | truncated
+        after[entries.REWARD] = torch.tensor([float(self.number)])
+        after[entries.TERMINATED], after[entries.DONE] = terminated, terminated | truncated
         frame["next"] = after
         self.number += 1
         self.frames.append(frame)
         self.episode_of.append(self.episode)
-        if after[keys.DONE]:
+        if after[entries.DONE]:
             self.begin()
         return frame
 
@@ -81,7 +81,7 @@ def held(replay):
     pairs = [(time, environment) for environment, first in enumerate(lower) for time in range(first, replay._now)]
     assert len(pairs) == len(replay)
     time, environment = torch.tensor(pairs).T
-    return {int(one["next", keys.REWARD]): one for one in replay._transitions(time, environment).unbind(0)}
+    return {int(one["next", entries.REWARD]): one for one in replay._transitions(time, environment).unbind(0)}
 
 
 def same(sampled, stored):
@@ -116,7 +116,7 @@ def test_what_is_held_equals_what_was_stored_bit_for_bit(num_envs, lengths, ends
             begun = sorted(set(one.episode_of))[-replay.episodes :]
             for frame, episode in list(zip(one.frames, one.episode_of, strict=True))[-replay.rows :]:
                 if episode in begun:
-                    expected[int(frame["next", keys.REWARD])] = frame
+                    expected[int(frame["next", entries.REWARD])] = frame
         assert kept.keys() == expected.keys()
         assert all(same(kept[number], expected[number]) for number in kept)
 
@@ -129,7 +129,7 @@ def test_sampling_is_uniform_over_all_that_is_held():
         replay.add(batch_of(some, 5))
     assert len(held(replay)) == len(replay) < 64  # short episodes made the first environment give up old frames
     torch.manual_seed(0)
-    drawn = replay.sample(20_000)["next", keys.REWARD].flatten().long()
+    drawn = replay.sample(20_000)["next", entries.REWARD].flatten().long()
     numbers, counts = drawn.unique(return_counts=True)
     assert set(numbers.tolist()) == held(replay).keys()
     mean = 20_000 / len(replay)
@@ -138,7 +138,7 @@ def test_sampling_is_uniform_over_all_that_is_held():
 
 def test_half_a_million_transitions_on_the_wall_fit_in_four_gibibytes(settings):
     env = make_env(settings("task=wall").task, RodParameters(), num_envs=128, seed=0)
-    observation = env.reset().select(*keys.OBSERVATION)
+    observation = env.reset().select(*entries.OBSERVATION)
     plain = 2 * sum(value.nbytes for value in observation.values(True, True)) / 128  # now and next, as they come
     replay = Replay(25_600, 128, env.n_agents, env.n_slots, "cpu")
     owned = [value for value in vars(replay).values() if isinstance(value, torch.Tensor)]
@@ -170,9 +170,9 @@ def test_transitions_of_the_arm_come_back_as_they_were(settings):
     ]
     assert len(replay) == len(stored) == 54
     assert all(same(one, other) for one, other in zip(sampled, stored, strict=True))
-    assert sum(frame["next", keys.DONE].item() for frame in stored) >= 12
-    assert max(int(frame[keys.SLOT_ACTIVE].sum()) for frame in stored) > 5
-    assert max(int(frame[keys.EDGE].sum()) for frame in stored) > 5
+    assert sum(frame["next", entries.DONE].item() for frame in stored) >= 12
+    assert max(int(frame[entries.SLOT_ACTIVE].sum()) for frame in stored) > 5
+    assert max(int(frame[entries.EDGE].sum()) for frame in stored) > 5
 
 
 def test_a_loaded_memory_holds_and_samples_the_same():
@@ -198,6 +198,6 @@ def test_what_cannot_be_stored_is_refused_with_a_reason():
     with pytest.raises(ValueError, match="it must hold the 10 frames of one iteration"):
         replay.add(batch_of(streams(2), 5))
     gap = batch_of(streams(2), 3)
-    gap[keys.SLOT_ACTIVE] = torch.arange(11).expand(2, 3, 11) == 4
+    gap[entries.SLOT_ACTIVE] = torch.arange(11).expand(2, 3, 11) == 4
     with pytest.raises(ValueError, match="are not its first ones"):
         replay.add(gap)

@@ -10,7 +10,7 @@ from torchrl.envs.utils import ExplorationType
 from torchrl.objectives import SACLoss
 
 from softgm_bench.algorithms.sac import SAC
-from softgm_bench.envs import keys, make_env
+from softgm_bench.envs import entries, make_env
 from softgm_bench.models.heads import LOC
 from softgm_bench.models.mlp import MLPConfig
 
@@ -152,7 +152,7 @@ def test_the_policy_writes_the_action_alone(build):
     algorithm, env = build()
     td = observe(env)
     before = set(td.keys(True, True))
-    assert set(algorithm.policy(td).keys(True, True)) == before | {keys.ACTION}
+    assert set(algorithm.policy(td).keys(True, True)) == before | {entries.ACTION}
 
 
 @pytest.mark.parametrize("model", ["mlp", "softgm"])
@@ -161,7 +161,7 @@ def test_an_update_moves_actor_critics_targets_and_temperature_on_every_model(bu
     algorithm, env = build(name, f"model={model}", "model.hidden=16", "task.sensing_radius=0.4", task="wall")
     loss = algorithm.loss
     (batch,) = batches(algorithm, env)
-    assert batch[keys.EDGE].any()
+    assert batch[entries.EDGE].any()
     groups = [loss.actor_network_params, loss.qvalue_network_params, loss.target_qvalue_network_params]
     before = [group.clone() for group in groups]
     alpha = loss.log_alpha.item()

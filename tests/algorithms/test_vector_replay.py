@@ -3,7 +3,7 @@ import torch
 from tensordict import TensorDict
 
 from softgm_bench.algorithms.vector_replay import VectorReplay
-from softgm_bench.envs import keys
+from softgm_bench.envs import entries
 from softgm_bench.envs.vmas import OBSERVATION
 
 
@@ -23,11 +23,11 @@ def test_a_sample_is_a_stored_transition():
     sample = replay.sample(64)
     number = sample[OBSERVATION][:, 0, 0]
     assert set(number.tolist()) == set(range(6))
-    assert torch.equal(sample[keys.ACTION][:, 3, 1], number)
+    assert torch.equal(sample[entries.ACTION][:, 3, 1], number)
     assert torch.equal(sample["next", *OBSERVATION][:, 3, 4], number + 0.5)
-    assert torch.equal(sample["next", keys.REWARD].squeeze(-1), -number)
-    assert torch.equal(sample["next", keys.DONE].squeeze(-1), number % 2 == 0)
-    assert torch.equal(sample["next", keys.TERMINATED].squeeze(-1), number % 2 == 1)
+    assert torch.equal(sample["next", entries.REWARD].squeeze(-1), -number)
+    assert torch.equal(sample["next", entries.DONE].squeeze(-1), number % 2 == 0)
+    assert torch.equal(sample["next", entries.TERMINATED].squeeze(-1), number % 2 == 1)
 
 
 def test_the_newest_are_kept():

@@ -5,7 +5,7 @@ import torch
 from torchrl.envs.utils import check_env_specs
 
 from round_trips import RoundTrips
-from softgm_bench.envs import keys, make_env
+from softgm_bench.envs import entries, make_env
 from softgm_bench.rod.dense import force_dense
 from softgm_bench.rod.parameters import RodParameters
 
@@ -48,7 +48,7 @@ def put_targets_at_the_tips(env, rows):
 
 def advance(env, td, action=None):
     """The frames after a step and after the resets that follow it."""
-    td = td.clone().set(keys.ACTION, torch.zeros(*env.batch_size, env.n_agents, 2) if action is None else action)
+    td = td.clone().set(entries.ACTION, torch.zeros(*env.batch_size, env.n_agents, 2) if action is None else action)
     out, following = env.step_and_maybe_reset(td)
     return out["next"], following
 
@@ -81,7 +81,7 @@ def test_who_does_not_ask_for_it_or_has_none_enabled_gets_the_same_bits_as_witho
     other = build(task, *overrides, curriculum=asked, horizon=3, stagger=True)
     assert other.task.max_cylinders == plain.task.max_cylinders
     found = play(other, 7)
-    assert keys.DIFFICULTY not in found[0]
+    assert entries.DIFFICULTY not in found[0]
     assert_same_bits(play(plain, 7), found)
 
 
@@ -93,8 +93,8 @@ def test_at_the_last_stage_whole_episodes_are_the_tasks_own_bit_for_bit(build, t
     eased.set_seed(0)
     plain.set_seed(0)
     expected, found = play(plain, 7), play(eased, 7)
-    assert all((frame[keys.DIFFICULTY] == 1.0).all() for frame in found)
-    assert_same_bits(expected, found, but=[keys.DIFFICULTY])
+    assert all((frame[entries.DIFFICULTY] == 1.0).all() for frame in found)
+    assert_same_bits(expected, found, but=[entries.DIFFICULTY])
 
 
 @pytest.mark.parametrize("task", ["basic", "structured"])
@@ -104,9 +104,9 @@ def test_the_same_state_gives_the_same_rewards_and_observations_with_and_without
     plain.reset()
     plain.load_simulation_state(eased.simulation_state())
     for action in actions(eased, 4):
-        td = td.clone().set(keys.ACTION, action)
+        td = td.clone().set(entries.ACTION, action)
         found, expected = eased.step(td.clone())["next"], plain.step(td.clone())["next"]
-        assert_same_bits([leaves(expected)], [leaves(found)], but=[keys.DIFFICULTY])
+        assert_same_bits([leaves(expected)], [leaves(found)], but=[entries.DIFFICULTY])
         td = found.exclude("reward")
 
 
@@ -115,12 +115,12 @@ def test_a_round_of_successes_is_a_stage_and_the_last_frames_keep_their_own_diff
     td = env.reset()
     sides = [0.6, 0.525, 0.45, 0.375, 0.3, 0.3]  # from 0.6 to 0.3 in four steps
     for stage, side in enumerate(sides):
-        assert torch.allclose(td[keys.PRIVILEGED][:, 3], torch.tensor(side))
-        assert torch.equal(td[keys.DIFFICULTY], torch.full((4, 1), min(stage, 4) / 4))
+        assert torch.allclose(td[entries.PRIVILEGED][:, 3], torch.tensor(side))
+        assert torch.equal(td[entries.DIFFICULTY], torch.full((4, 1), min(stage, 4) / 4))
         put_targets_at_the_tips(env, [0, 1, 2, 3])
         after, td = advance(env, td)
         assert after["terminated"].all()
-        assert torch.equal(after[keys.DIFFICULTY], torch.full((4, 1), min(stage, 4) / 4))
+        assert torch.equal(after[entries.DIFFICULTY], torch.full((4, 1), min(stage, 4) / 4))
 
 
 def test_a_round_of_failures_is_a_stage_back(build):
@@ -128,7 +128,7 @@ def test_a_round_of_failures_is_a_stage_back(build):
     edit(env, lambda state: state["curriculum", "stage"].fill_(3))
     td, seen = env.reset(), []
     for _ in range(5):
-        seen.append(td[keys.DIFFICULTY].unique().item())
+        seen.append(td[entries.DIFFICULTY].unique().item())
         _, td = advance(env, td)
     assert seen == [0.75, 0.5, 0.25, 0.0, 0.0]
 
@@ -140,15 +140,15 @@ def test_broken_episodes_are_failures(build):
     put_targets_at_the_tips(env, [0, 1, 2, 3])
     edit(env, lambda state: state["rod", "velocity"].fill_(float("nan")))
     after, td = advance(env, td)
-    assert after[keys.DIVERGED].all()
-    assert torch.equal(td[keys.DIFFICULTY], torch.full((4, 1), 0.25))
+    assert after[entries.DIVERGED].all()
+    assert torch.equal(td[entries.DIFFICULTY], torch.full((4, 1), 0.25))
 
 
 def test_an_episode_that_has_ended_and_is_not_reset_counts_once(build):
     env = build("basic", ENABLED, ROUND, horizon=1, num_envs=2)  # a round is two episodes of each
-    td = env.reset().set(keys.ACTION, torch.zeros(2, 6, 2))
+    td = env.reset().set(entries.ACTION, torch.zeros(2, 6, 2))
     for _ in range(3):
-        td = env.step(td.clone().exclude("next"))["next"].exclude("reward").set(keys.ACTION, torch.zeros(2, 6, 2))
+        td = env.step(td.clone().exclude("next"))["next"].exclude("reward").set(entries.ACTION, torch.zeros(2, 6, 2))
         assert env.simulation_state()["curriculum", "counted"].tolist() == [1, 1]
 
 
@@ -168,7 +168,7 @@ def test_a_partial_reset_at_another_difficulty_changes_no_bit_of_the_others(buil
         env = build(task, ENABLED, substeps=10)
         td = env.reset()
         for step, action in enumerate(actions(env, 4)):
-            td = env.step(td.clone().set(keys.ACTION, action))["next"].exclude("reward")
+            td = env.step(td.clone().set(entries.ACTION, action))["next"].exclude("reward")
             if reset and step == 1:
                 edit(env, lambda state: state["curriculum", "stage"].fill_(7))
                 td = env.reset(td.set("_reset", torch.tensor([[False], [True], [False], [False]])))
@@ -178,8 +178,8 @@ def test_a_partial_reset_at_another_difficulty_changes_no_bit_of_the_others(buil
     others = [0, 2, 3]
     for key, value in undisturbed.items():
         assert torch.equal(value[others], disturbed[key][others]), key
-    assert undisturbed[keys.DIFFICULTY].squeeze(-1).tolist() == [0.0] * 4
-    assert torch.allclose(disturbed[keys.DIFFICULTY].squeeze(-1), torch.tensor([0.0, 0.7, 0.0, 0.0]))
+    assert undisturbed[entries.DIFFICULTY].squeeze(-1).tolist() == [0.0] * 4
+    assert torch.allclose(disturbed[entries.DIFFICULTY].squeeze(-1), torch.tensor([0.0, 0.7, 0.0, 0.0]))
 
 
 def test_a_curriculum_goes_on_bit_for_bit_from_its_saved_state(build):
@@ -189,7 +189,7 @@ def test_a_curriculum_goes_on_bit_for_bit_from_its_saved_state(build):
         if step == 2:
             put_targets_at_the_tips(env, [0, 1, 2])
         _, td = advance(env, td)
-    assert td[keys.DIFFICULTY].max() > 0.0
+    assert td[entries.DIFFICULTY].max() > 0.0
     state, generator = env.simulation_state(), env.generator_state()
 
     def finish(env, td):
@@ -207,7 +207,7 @@ def test_a_curriculum_goes_on_bit_for_bit_from_its_saved_state(build):
     other.load_simulation_state(state)
     other.set_generator_state(generator)
     assert_same_bits(expected, finish(other, td))
-    assert expected[-1][keys.DIFFICULTY].max() > expected[0][keys.DIFFICULTY].max()
+    assert expected[-1][entries.DIFFICULTY].max() > expected[0][entries.DIFFICULTY].max()
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -216,7 +216,7 @@ def test_nothing_waits_for_a_device(build, task):
     td = env.reset()
     with force_dense():
         advance(env, td)  # constants are copied once
-        prepared = [td.clone().set(keys.ACTION, action) for action in actions(env, 6)]
+        prepared = [td.clone().set(entries.ACTION, action) for action in actions(env, 6)]
         env.backend.control_step = lambda state, *_, **__: state.clone()  # the CPU's kernel looks at values
         with RoundTrips() as trips:
             for td in prepared:

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from softgm_bench.envs import keys, make_env
+from softgm_bench.envs import entries, make_env
 from softgm_bench.rod.parameters import RodParameters
 
 
@@ -22,9 +22,9 @@ def test_full_torque_that_keeps_changing_sign_against_the_wall_breaks_nothing(se
         state = env.simulation_state()
         state["terminated"].zero_()
         env.load_simulation_state(state)
-        td = env.step(td.exclude("reward").clone().set(keys.ACTION, action))["next"]
-        diverged |= td[keys.DIVERGED]
-        touched += td[keys.CONTACT_NODES].mean().item()
+        td = env.step(td.exclude("reward").clone().set(entries.ACTION, action))["next"]
+        diverged |= td[entries.DIVERGED]
+        touched += td[entries.CONTACT_NODES].mean().item()
     assert not diverged.any()
     assert touched > 100.0
     director = env.simulation_state()["rod", "director"]

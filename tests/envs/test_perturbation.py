@@ -4,12 +4,12 @@ from test_round_trips import Standing, actions, leaves
 from torchrl.envs.utils import check_env_specs
 
 from round_trips import RoundTrips
-from softgm_bench.envs import keys, make_env
+from softgm_bench.envs import entries, make_env
 from softgm_bench.envs.perturbation import PerturbationConfig
 from softgm_bench.rod.dense import force_dense
 from softgm_bench.rod.parameters import RodParameters
 
-OBSERVED = (keys.AGENT_POSITION, keys.AGENT_VELOCITY, keys.PREVIOUS_ACTION)
+OBSERVED = (entries.AGENT_POSITION, entries.AGENT_VELOCITY, entries.PREVIOUS_ACTION)
 CASES = ("none", "noise", "section_failure", "disturbance")
 
 
@@ -28,7 +28,7 @@ def play(env, steps=12):
     td = env.reset()
     frames = [leaves(td)]
     for action in actions(env, steps):
-        td = env.step(td.exclude("next", "reward").set(keys.ACTION, action))["next"]
+        td = env.step(td.exclude("next", "reward").set(entries.ACTION, action))["next"]
         frames.append(leaves(td))
     return frames
 
@@ -48,7 +48,7 @@ def test_scenes_are_those_without_a_perturbation_also_after_resets(build, case):
     for env in (ordinary, perturbed):
         td = env.reset()
         for action in actions(env, 7):
-            _, td = env.step_and_maybe_reset(td.set(keys.ACTION, action))
+            _, td = env.step_and_maybe_reset(td.set(entries.ACTION, action))
     assert equal(leaves(ordinary.scene.to_tensordict()), leaves(perturbed.scene.to_tensordict()))
 
 
@@ -75,7 +75,7 @@ def test_noise_has_the_settings_deviations_is_independent_and_reaches_nothing_el
 def test_only_the_channels_with_a_deviation_are_noisy(build):
     frames = play(build("noise", "perturbation.velocity_sigma=0", "perturbation.action_sigma=0"))
     true = play(build())
-    assert not torch.equal(frames[-1][keys.AGENT_POSITION], true[-1][keys.AGENT_POSITION])
+    assert not torch.equal(frames[-1][entries.AGENT_POSITION], true[-1][entries.AGENT_POSITION])
     for key in OBSERVED[1:]:
         assert torch.equal(frames[-1][key], true[-1][key])
 
@@ -86,11 +86,11 @@ def test_a_section_that_failed_is_as_one_that_is_told_to_do_nothing(build):
     for action in actions(told, 8):
         silent = action.clone()
         silent[:, [2, 5]] = 0.0
-        one = failing.step(one.exclude("next", "reward").set(keys.ACTION, action))["next"]
-        other = told.step(other.exclude("next", "reward").set(keys.ACTION, silent))["next"]
+        one = failing.step(one.exclude("next", "reward").set(entries.ACTION, action))["next"]
+        other = told.step(other.exclude("next", "reward").set(entries.ACTION, silent))["next"]
         assert equal(leaves(one.exclude("agents")), leaves(other.exclude("agents")))
         assert torch.equal(failing.applied_action, silent)
-        assert torch.equal(one[keys.PREVIOUS_ACTION], silent)
+        assert torch.equal(one[entries.PREVIOUS_ACTION], silent)
     assert torch.equal(failing.rod.position, told.rod.position)
 
 
@@ -99,7 +99,7 @@ def test_the_push_has_its_strength_and_time_and_a_direction_of_its_own_in_every_
     td = env.reset()
     forces = []
     for action in actions(env, 26):
-        _, td = env.step_and_maybe_reset(td.set(keys.ACTION, action))
+        _, td = env.step_and_maybe_reset(td.set(entries.ACTION, action))
         forces.append(env.tip_force)
     strength = torch.stack(forces).norm(dim=-1)
     pushed = torch.arange(26) % 13
@@ -116,7 +116,7 @@ def test_the_push_is_a_force_on_the_tip_node(build):
     env = build("disturbance", "perturbation.first_step=0", "perturbation.steps=1", task="basic", substeps=1)
     td = env.reset()
     state = env.rod.clone()
-    env.step(td.set(keys.ACTION, torch.zeros(4, 6, 2)))
+    env.step(td.set(entries.ACTION, torch.zeros(4, 6, 2)))
     force = torch.zeros_like(state.position)
     force[..., -1] = env.tip_force
     couple = torch.zeros(4, 3, 60, dtype=torch.float64)
@@ -145,14 +145,14 @@ def test_a_saved_state_goes_on_bit_by_bit(build):
     env, other = make(0), make(1)
     td = env.reset()
     for action in actions(env, 4):
-        _, td = env.step_and_maybe_reset(td.set(keys.ACTION, action))
+        _, td = env.step_and_maybe_reset(td.set(entries.ACTION, action))
     other.reset()
     other.load_simulation_state(env.simulation_state())
     other.set_generator_state(env.generator_state())
     theirs = td.clone()
     for action in actions(env, 12):  # into the next episode
-        _, td = env.step_and_maybe_reset(td.set(keys.ACTION, action))
-        _, theirs = other.step_and_maybe_reset(theirs.set(keys.ACTION, action))
+        _, td = env.step_and_maybe_reset(td.set(entries.ACTION, action))
+        _, theirs = other.step_and_maybe_reset(theirs.set(entries.ACTION, action))
         assert equal(leaves(td), leaves(theirs))
         assert torch.equal(env.tip_force, other.tip_force)
 
@@ -163,10 +163,10 @@ def test_neither_steps_nor_resets_wait_for_a_device(build, case):
     env.backend = Standing(env.backend.parameters)
     td = env.reset()
     with force_dense():
-        env.step_and_maybe_reset(td.clone().set(keys.ACTION, actions(env, 1)[0]))  # constants are copied once
+        env.step_and_maybe_reset(td.clone().set(entries.ACTION, actions(env, 1)[0]))  # constants are copied once
         with RoundTrips() as trips:
             for action in actions(env, 6):
-                _, td = env.step_and_maybe_reset(td.set(keys.ACTION, action))
+                _, td = env.step_and_maybe_reset(td.set(entries.ACTION, action))
     assert trips.found == []
 
 
@@ -175,10 +175,10 @@ def test_contacts_are_the_nodes_that_the_metric_counts(build):
     td = env.reset()
     push = actions(env, 1)[0, :, :1].expand(16, 6, 2)
     for _ in range(25):
-        td = env.step(td.exclude("next", "reward").set(keys.ACTION, push))["next"]
+        td = env.step(td.exclude("next", "reward").set(entries.ACTION, push))["next"]
     touching = env.contacts()
     assert touching.any()
-    assert torch.equal(touching.sum(-1, keepdim=True).float(), td[keys.CONTACT_NODES])
+    assert torch.equal(touching.sum(-1, keepdim=True).float(), td[entries.CONTACT_NODES])
     assert not build(task="basic").contacts().any()
 
 

@@ -5,7 +5,7 @@ import torch
 from torchrl.collectors import Collector
 from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
 
-from softgm_bench.envs import keys, make_env
+from softgm_bench.envs import entries, make_env
 from softgm_bench.models.heads import build_actor
 from softgm_bench.rod.parameters import RodParameters
 
@@ -24,7 +24,7 @@ def build(settings):
 @pytest.mark.parametrize("task", WALLS)
 def test_a_wall_tells_its_openings_centre_and_side(build, settings, task):
     env, side = build(task, num_envs=64), settings(f"task={task}").task.opening_side
-    privileged = env.reset()[keys.PRIVILEGED]
+    privileged = env.reset()[entries.PRIVILEGED]
     assert privileged.shape == (64, env.n_privileged) == (64, 4)
     assert privileged.dtype == torch.float32
     assert torch.allclose(privileged[:, 0], torch.tensor(0.4))
@@ -42,19 +42,19 @@ def test_a_wall_tells_its_openings_centre_and_side(build, settings, task):
 def test_it_stays_through_an_episode_and_changes_with_the_next(build):
     env = build("wall", horizon=2)
     td = env.reset()
-    first = td[keys.PRIVILEGED].clone()
+    first = td[entries.PRIVILEGED].clone()
     for last in (False, True):
-        out, td = env.step_and_maybe_reset(td.set(keys.ACTION, torch.zeros(4, 6, 2)))
-        assert torch.equal(out["next", keys.PRIVILEGED], first)
-        assert torch.equal(td[keys.PRIVILEGED], first) != last
+        out, td = env.step_and_maybe_reset(td.set(entries.ACTION, torch.zeros(4, 6, 2)))
+        assert torch.equal(out["next", entries.PRIVILEGED], first)
+        assert torch.equal(td[entries.PRIVILEGED], first) != last
 
 
 @pytest.mark.parametrize("task", ["basic", "structured"])
 def test_where_there_is_nothing_to_tell_the_entry_is_absent(build, task):
     env = build(task)
     assert env.n_privileged == 0
-    assert keys.PRIVILEGED not in set(env.reset().keys())
-    assert keys.PRIVILEGED not in set(env.observation_spec.keys())
+    assert entries.PRIVILEGED not in set(env.reset().keys())
+    assert entries.PRIVILEGED not in set(env.observation_spec.keys())
     check_env_specs(env)
 
 
@@ -65,10 +65,10 @@ def test_the_collector_hands_it_on_for_now_and_next(build):
         (batch,) = list(collector)
     finally:
         collector.shutdown()
-    assert batch[keys.PRIVILEGED].shape == batch["next", keys.PRIVILEGED].shape == (4, 8, 4)
+    assert batch[entries.PRIVILEGED].shape == batch["next", entries.PRIVILEGED].shape == (4, 8, 4)
     same_episode = ~batch["next", "done"].squeeze(-1)[:, :-1]
     assert torch.equal(
-        batch[keys.PRIVILEGED][:, 1:][same_episode], batch["next", keys.PRIVILEGED][:, :-1][same_episode]
+        batch[entries.PRIVILEGED][:, 1:][same_episode], batch["next", entries.PRIVILEGED][:, :-1][same_episode]
     )
 
 
@@ -77,8 +77,8 @@ def test_it_reaches_no_actor(build, settings, model):
     env, config = build("wall"), settings("task=wall", "algo=softgm", f"model={model}")
     policy = build_actor(config.model, env.n_agents, env.n_slots, config.algo.actor)
     td = env.reset()
-    assert keys.PRIVILEGED not in keys.OBSERVATION
+    assert entries.PRIVILEGED not in entries.OBSERVATION
     with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
-        expected = policy(td.clone())[keys.ACTION]
-        td[keys.PRIVILEGED].fill_(float("nan"))
-        assert torch.equal(policy(td.clone())[keys.ACTION], expected)
+        expected = policy(td.clone())[entries.ACTION]
+        td[entries.PRIVILEGED].fill_(float("nan"))
+        assert torch.equal(policy(td.clone())[entries.ACTION], expected)

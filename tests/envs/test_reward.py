@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from softgm_bench.envs import keys
+from softgm_bench.envs import entries
 from softgm_bench.envs.reward import reward_terms
 from softgm_bench.envs.tasks.base import RewardConfig
 
@@ -50,7 +50,7 @@ def test_every_term_of_the_papers_formula_worked_out_by_hand():
             "success": 0.0,
         }
     )
-    assert tuple(found) == keys.REWARD_TERM_NAMES
+    assert tuple(found) == entries.REWARD_TERM_NAMES
 
 
 def test_no_contact_costs_nothing_and_cannot_be_stuck():

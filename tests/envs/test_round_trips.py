@@ -5,7 +5,7 @@ import torch
 from torchrl.envs import EnvBase
 
 from round_trips import RoundTrips
-from softgm_bench.envs import SoftArmEnv, keys, make_env
+from softgm_bench.envs import SoftArmEnv, entries, make_env
 from softgm_bench.rod.dense import force_dense
 from softgm_bench.rod.parameters import RodParameters
 
@@ -46,10 +46,10 @@ def test_neither_steps_nor_resets_wait_for_a_device(build, task):
     env.backend = Standing(env.backend.parameters)
     td = env.reset()
     with force_dense():
-        env.step_and_maybe_reset(td.clone().set(keys.ACTION, actions(env, 1)[0]))  # constants are copied once
+        env.step_and_maybe_reset(td.clone().set(entries.ACTION, actions(env, 1)[0]))  # constants are copied once
         with RoundTrips() as trips:
             for action in actions(env, 6):
-                _, td = env.step_and_maybe_reset(td.set(keys.ACTION, action))
+                _, td = env.step_and_maybe_reset(td.set(entries.ACTION, action))
     assert trips.found == []
     assert not td["done"].any()  # the horizon has come by, so there were resets
 
@@ -57,7 +57,7 @@ def test_neither_steps_nor_resets_wait_for_a_device(build, task):
 def test_the_same_watch_finds_the_cpus_shortcuts(build):
     env = build("wall")
     with RoundTrips() as trips:
-        env.step_and_maybe_reset(env.reset().set(keys.ACTION, actions(env, 1)[0]))
+        env.step_and_maybe_reset(env.reset().set(entries.ACTION, actions(env, 1)[0]))
     assert any("soft_arm.py" in found for found in trips.found)
 
 
@@ -66,7 +66,7 @@ def test_a_step_can_be_taken_where_tensors_have_no_values_and_no_cpu_tensor_join
     """On the meta device a look at any value raises, and so does an operation between two devices."""
     env = build(task)
     env.backend = Standing(env.backend.parameters)
-    td = env.reset().set(keys.ACTION, actions(env, 1)[0])
+    td = env.reset().set(entries.ACTION, actions(env, 1)[0])
     expected = leaves(env._step(td))
     vars(env)["_device"] = torch.device("meta")  # env.to() would look at the bounds in the specs
     for name, value in vars(env).items():
@@ -94,7 +94,7 @@ def test_both_ways_make_the_same_episodes_bit_by_bit(build, task, dtype):
                 state = env.simulation_state()
                 state["rod", "velocity"][2, 0, 5] = float("nan")
                 env.load_simulation_state(state)
-            td = env.step(td.exclude("next", "reward").set(keys.ACTION, action))["next"]
+            td = env.step(td.exclude("next", "reward").set(entries.ACTION, action))["next"]
             frames.append(leaves(td))
         return frames
 
@@ -122,12 +122,12 @@ def test_automatic_resets_equal_torchrls_and_leave_the_last_frames_alone(build, 
         env = build(task, horizon=4, stagger=True)
         td, frames, resets = env.reset(), [], 0
         for action in actions(env, 9):
-            out = env.step(td.set(keys.ACTION, action))
+            out = env.step(td.set(entries.ACTION, action))
             last = leaves(out["next"].clone())
             resets += int(last["done"].sum())
             td = maybe_reset(env, env._step_mdp(out))
             assert all(torch.equal(value, last[key]) for key, value in leaves(out["next"]).items())
-            frames.append({key: value.clone() for key, value in leaves(td).items() if key != keys.ACTION})
+            frames.append({key: value.clone() for key, value in leaves(td).items() if key != entries.ACTION})
         assert resets > 6
         return frames
 

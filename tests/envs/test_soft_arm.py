@@ -2,7 +2,7 @@ import pytest
 import torch
 from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type, step_mdp
 
-from softgm_bench.envs import keys, make_env
+from softgm_bench.envs import entries, make_env
 from softgm_bench.models.heads import build_actor
 from softgm_bench.rod.parameters import RodParameters
 
@@ -21,7 +21,7 @@ def build(settings):
 
 def act(env, td, action):
     """One step from ``td``, which is left as it is."""
-    return env.step(td.exclude("reward").clone().set(keys.ACTION, action))["next"]
+    return env.step(td.exclude("reward").clone().set(entries.ACTION, action))["next"]
 
 
 def random_actions(env, steps, seed=0):
@@ -65,30 +65,30 @@ def test_agents_and_elements_are_parameters(build, n_agents, n_elements):
     rod = RodParameters(n_elements=n_elements, substeps=5)
     env = build("structured", overrides=(f"task.n_agents={n_agents}", "task.slots=5"), rod=rod)
     td = play(env, random_actions(env, 2))
-    assert td[keys.AGENT_POSITION].shape == (2, 4, n_agents, 3)
-    assert td[keys.EDGE].shape == (2, 4, n_agents, 5)
-    assert td[keys.AGENT_POSITION].isfinite().all()
+    assert td[entries.AGENT_POSITION].shape == (2, 4, n_agents, 3)
+    assert td[entries.EDGE].shape == (2, 4, n_agents, 5)
+    assert td[entries.AGENT_POSITION].isfinite().all()
 
 
 def test_agents_sit_on_the_nodes_nearest_to_their_control_points(build):
     td = build("basic").reset()
     expected = torch.tensor([9, 17, 26, 34, 43, 51]) / 60  # i * 60 / 7, rounded
-    assert torch.allclose(td[keys.AGENT_POSITION][0, :, 2], expected)
+    assert torch.allclose(td[entries.AGENT_POSITION][0, :, 2], expected)
     assert torch.equal(td["tip"][0], torch.tensor([0.0, 0.0, 1.0]))
 
 
 def test_the_reward_is_the_sum_of_its_terms(build):
     env = build("wall", rod=RodParameters())
     td = play(env, random_actions(env, 5))
-    total = sum(td["reward_terms", name] for name in keys.REWARD_TERM_NAMES)
+    total = sum(td["reward_terms", name] for name in entries.REWARD_TERM_NAMES)
     assert torch.allclose(td["reward"], total, atol=1e-6)
 
 
 def test_both_torque_metrics_are_norms_of_the_applied_torque(build):
     env = build("basic")
     td = act(env, env.reset(), torch.ones(4, 6, 2))
-    assert torch.allclose(td[keys.TORQUE_PER_AGENT], torch.tensor(25.0 * 2**0.5))
-    assert torch.allclose(td[keys.TORQUE_JOINT], torch.tensor(25.0 * 12**0.5))
+    assert torch.allclose(td[entries.TORQUE_PER_AGENT], torch.tensor(25.0 * 2**0.5))
+    assert torch.allclose(td[entries.TORQUE_JOINT], torch.tensor(25.0 * 12**0.5))
 
 
 def test_success_terminates_pays_and_is_not_a_truncation(build):
@@ -100,9 +100,9 @@ def test_success_terminates_pays_and_is_not_a_truncation(build):
 
     edit(env, aim)
     td = act(env, td, torch.zeros(4, 6, 2))
-    assert td[keys.SUCCESS].squeeze(-1).tolist() == [False, True, False, False]
-    assert torch.equal(td["terminated"], td[keys.SUCCESS])
-    assert torch.equal(td["truncated"], ~td[keys.SUCCESS])
+    assert td[entries.SUCCESS].squeeze(-1).tolist() == [False, True, False, False]
+    assert torch.equal(td["terminated"], td[entries.SUCCESS])
+    assert torch.equal(td["truncated"], ~td[entries.SUCCESS])
     assert td["done"].all()
     assert td["reward_terms", "success"].squeeze(-1).tolist() == [0.0, 50.0, 0.0, 0.0]
 
@@ -111,7 +111,7 @@ def test_an_environment_that_is_done_stands_still_until_it_is_reset(build):
     env = build("basic", horizon=2)
     td = env.reset()
     for action in random_actions(env, 2):
-        td = step_mdp(env.step(td.set(keys.ACTION, action)))
+        td = step_mdp(env.step(td.set(entries.ACTION, action)))
     state = env.simulation_state()
     act(env, td, torch.ones(4, 6, 2))
     after = env.simulation_state()
@@ -129,16 +129,16 @@ def test_a_partial_reset_changes_no_bit_of_the_others(build, task):
         td = env.reset()
         actions = random_actions(env, 4)
         for step, action in enumerate(actions):
-            td = step_mdp(env.step(td.set(keys.ACTION, action)))
+            td = step_mdp(env.step(td.set(entries.ACTION, action)))
             if reset and step == 1:
                 td = env.reset(td.set("_reset", torch.tensor([[False], [True], [False], [False]])))
         return td
 
     undisturbed, disturbed = episode(False), episode(True)
     others = [0, 2, 3]
-    for key in keys.OBSERVATION:
+    for key in entries.OBSERVATION:
         assert torch.equal(undisturbed[key][others], disturbed[key][others]), key
-    assert not torch.equal(undisturbed[keys.AGENT_POSITION][1], disturbed[keys.AGENT_POSITION][1])
+    assert not torch.equal(undisturbed[entries.AGENT_POSITION][1], disturbed[entries.AGENT_POSITION][1])
 
 
 @pytest.mark.parametrize("backend", ["numba", "torch"])
@@ -158,19 +158,19 @@ def test_a_state_that_is_not_finite_ends_that_environment_and_changes_no_bit_of_
 
     clean, poisoned = episode(False), episode(True)
     others = [0, 2, 3]
-    for key in (*keys.OBSERVATION, "reward", "done"):
+    for key in (*entries.OBSERVATION, "reward", "done"):
         assert torch.equal(clean[key][:, others], poisoned[key][:, others]), key
-    assert poisoned[keys.DIVERGED][2:, 1].any()
+    assert poisoned[entries.DIVERGED][2:, 1].any()
     assert poisoned["terminated"][2:, 1].all()
     assert not poisoned["truncated"].any()
-    assert not poisoned[keys.SUCCESS][:, 1].any()
+    assert not poisoned[entries.SUCCESS][:, 1].any()
 
 
 def test_what_a_diverging_environment_shows_is_its_last_good_state(build):
     env = build("basic", overrides=("task.max_dilatation=1.0000001",), rod=RodParameters())
     start = env.reset()
     td = act(env, start, torch.ones(4, 6, 2))
-    assert td[keys.DIVERGED].all()
+    assert td[entries.DIVERGED].all()
     assert td["terminated"].all()
     assert torch.equal(td["tip"], start["tip"])
     assert td["reward"].isfinite().all()
@@ -207,7 +207,7 @@ def test_an_episode_goes_on_bit_for_bit_from_its_saved_state(build):
     other.load_simulation_state(state)
     other.set_generator_state(generator)
     found_reset, found = finish(other, td)
-    for key in (*keys.OBSERVATION, "reward"):
+    for key in (*entries.OBSERVATION, "reward"):
         assert torch.equal(expected[key], found[key]), key
     assert torch.equal(expected_reset["target"], found_reset["target"])
 
@@ -224,16 +224,16 @@ def test_moving_an_undiscovered_obstacle_changes_no_bit_of_any_action(build, set
     push[..., 0] = 0.9  # towards the wall
     for _ in range(60):
         td = act(env, td, push)
-        if (td[keys.DISCOVERED] > 0).all():
+        if (td[entries.DISCOVERED] > 0).all():
             break
-    assert (td[keys.DISCOVERED] > 0).all()
+    assert (td[entries.DISCOVERED] > 0).all()
     state = env.simulation_state()
 
     def observe(change):
         env.load_simulation_state(change(state.clone()))
         out = act(env, td, torch.zeros(4, 6, 2))
         with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
-            return policy(out.select(*keys.OBSERVATION))
+            return policy(out.select(*entries.OBSERVATION))
 
     unchanged = observe(lambda state: state)
     known = env.simulation_state()["table", "known"]  # after the step: what it may still discover stays in place
@@ -249,17 +249,17 @@ def test_moving_an_undiscovered_obstacle_changes_no_bit_of_any_action(build, set
         return state
 
     moved, seen = observe(move_unknown), observe(move_known)
-    for key in (*keys.OBSERVATION, keys.ACTION):
+    for key in (*entries.OBSERVATION, entries.ACTION):
         assert torch.equal(unchanged[key], moved[key]), key
     # the same test notices a change of what has been discovered
-    assert not torch.equal(unchanged[keys.ACTION], seen[keys.ACTION])
+    assert not torch.equal(unchanged[entries.ACTION], seen[entries.ACTION])
 
 
 def test_staggered_episodes_are_truncated_at_different_steps_at_first_and_at_the_horizon_afterwards(build):
     env = build("basic", num_envs=32, horizon=6, stagger=True, rod=RodParameters(substeps=1))
     td, ends = env.reset(), []
     for _ in range(12):
-        td, following = env.step_and_maybe_reset(td.set(keys.ACTION, torch.zeros(32, 6, 2)))
+        td, following = env.step_and_maybe_reset(td.set(entries.ACTION, torch.zeros(32, 6, 2)))
         ends.append(td["next", "truncated"].squeeze(-1))
         td = following
     ends = torch.stack(ends)

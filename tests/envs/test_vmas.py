@@ -4,7 +4,7 @@ import pytest
 import torch
 from torchrl.envs import check_env_specs
 
-from softgm_bench.envs import keys
+from softgm_bench.envs import entries
 from softgm_bench.envs.vmas import OBSERVATION, SCENARIOS, VmasConfig, VmasEnv
 
 vmas = pytest.importorskip("vmas", reason="VMAS is an optional extra: pip install 'softgm-bench[vmas]'")
@@ -31,7 +31,7 @@ def random_actions(env, steps):
 
 def step(env, data, action):
     """The step's data and what follows it, environments that are done beginning again."""
-    return env.step_and_maybe_reset(data.set(keys.ACTION, action))
+    return env.step_and_maybe_reset(data.set(entries.ACTION, action))
 
 
 def test_specs_hold(config):
@@ -44,11 +44,11 @@ def test_steps_are_vmas_own(config):
     peer, observation = theirs(config, seed=3)
     torch.testing.assert_close(data[OBSERVATION], observation, rtol=0, atol=0)
     for action in random_actions(env, 15):
-        data = env.step(data.set(keys.ACTION, action))["next"]
+        data = env.step(data.set(entries.ACTION, action))["next"]
         observations, rewards, done, _ = peer.step(list(action.unbind(1)))
         torch.testing.assert_close(data[OBSERVATION], torch.stack(observations, dim=1), rtol=0, atol=0)
-        torch.testing.assert_close(data[keys.REWARD].squeeze(-1), torch.stack(rewards).mean(0), rtol=0, atol=0)
-        assert torch.equal(data[keys.TERMINATED].squeeze(-1), done)
+        torch.testing.assert_close(data[entries.REWARD].squeeze(-1), torch.stack(rewards).mean(0), rtol=0, atol=0)
+        assert torch.equal(data[entries.TERMINATED].squeeze(-1), done)
 
 
 def test_an_episode_that_begins_again_is_one_of_the_next_full_reset(config):
@@ -58,7 +58,7 @@ def test_an_episode_that_begins_again_is_one_of_the_next_full_reset(config):
     fresh = torch.stack(peer.reset(), dim=1)  # the draw after the first one
     actions = random_actions(env, 5)
     for action in actions[:3]:
-        data = env.step(data.set(keys.ACTION, action))["next"]
+        data = env.step(data.set(entries.ACTION, action))["next"]
     before = data[OBSERVATION].clone()
     mask = torch.tensor([False, True, False, False, True, False])
     data = env.reset(data.select("agents").set("_reset", mask.unsqueeze(-1)))
@@ -66,7 +66,7 @@ def test_an_episode_that_begins_again_is_one_of_the_next_full_reset(config):
     torch.testing.assert_close(data[OBSERVATION][~mask], before[~mask], rtol=0, atol=0)
 
     for action in actions[3:]:  # the others go on as if nothing had happened, and the new ones as VMAS's do
-        data = env.step(data.set(keys.ACTION, action))["next"]
+        data = env.step(data.set(entries.ACTION, action))["next"]
         shifted = action.clone()
         shifted[:2] = action[mask]
         observations, _, _, _ = peer.step(list(shifted.unbind(1)))
@@ -76,7 +76,7 @@ def test_an_episode_that_begins_again_is_one_of_the_next_full_reset(config):
         observations, rewards, _, _ = undisturbed.step(list(action.unbind(1)))
     torch.testing.assert_close(data[OBSERVATION][~mask], torch.stack(observations, dim=1)[~mask], rtol=0, atol=0)
     mean = torch.stack(rewards).mean(0)
-    torch.testing.assert_close(data[keys.REWARD].squeeze(-1)[~mask], mean[~mask], rtol=0, atol=0)
+    torch.testing.assert_close(data[entries.REWARD].squeeze(-1)[~mask], mean[~mask], rtol=0, atol=0)
 
 
 def test_more_episodes_than_one_store_holds(config):
@@ -98,11 +98,13 @@ def test_the_horizon_ends_an_episode(limit_terminates):
     rest = torch.zeros(ENVS, env.n_agents, 2)
     for count in range(1, 102):
         now, data = step(env, data, rest)
-        done, terminated, truncated = (now["next", key] for key in (keys.DONE, keys.TERMINATED, keys.TRUNCATED))
+        done, terminated, truncated = (
+            now["next", key] for key in (entries.DONE, entries.TERMINATED, entries.TRUNCATED)
+        )
         assert bool(done.all()) == bool(done.any()) == (count == 100)
         assert torch.equal(terminated, done & limit_terminates)
         assert torch.equal(truncated, done & (not limit_terminates))
-        assert not data[keys.DONE].any()
+        assert not data[entries.DONE].any()
 
 
 def test_seeds_decide_and_global_generators_do_not(config):
@@ -132,4 +134,4 @@ def test_a_saved_state_goes_on_exactly(config):
         _, data = step(env, data, action)
         _, copy = step(other, copy, action)
         assert torch.equal(data[OBSERVATION], copy[OBSERVATION])
-        assert torch.equal(data[keys.DONE], copy[keys.DONE])
+        assert torch.equal(data[entries.DONE], copy[entries.DONE])

@@ -5,7 +5,7 @@ from tensordict import TensorDict
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from softgm_bench.envs import keys
+from softgm_bench.envs import entries
 
 N_AGENTS = 2
 
@@ -17,7 +17,7 @@ class CountingEnv(EnvBase):
         self.lengths = torch.tensor(lengths)
         super().__init__(device="cpu", batch_size=(len(lengths),))
         batch = self.batch_size
-        self.observation_spec = Composite({keys.TIP: Unbounded((*batch, 3))}, shape=batch)
+        self.observation_spec = Composite({entries.TIP: Unbounded((*batch, 3))}, shape=batch)
         self.action_spec = Composite(
             agents=Composite(action=Bounded(-1.0, 1.0, (*batch, N_AGENTS, 2)), shape=batch), shape=batch
         )
@@ -30,20 +30,20 @@ class CountingEnv(EnvBase):
 
     def _reset(self, tensordict=None):
         self.count = torch.zeros(self.batch_size, dtype=torch.int64)
-        return TensorDict({keys.TIP: torch.zeros(*self.batch_size, 3)}, self.batch_size)
+        return TensorDict({entries.TIP: torch.zeros(*self.batch_size, 3)}, self.batch_size)
 
     def _step(self, tensordict):
         self.count += 1
         done = (self.count >= self.lengths).unsqueeze(-1)
         even = (torch.arange(len(self.lengths)) % 2 == 0).unsqueeze(-1)
         one = torch.ones(*self.batch_size, 1)
-        action = tensordict[keys.ACTION]
+        action = tensordict[entries.ACTION]
         return TensorDict(
             {
-                keys.TIP: torch.zeros(*self.batch_size, 3),
-                keys.REWARD: one,
-                keys.DONE: done,
-                keys.TERMINATED: done,
+                entries.TIP: torch.zeros(*self.batch_size, 3),
+                entries.REWARD: one,
+                entries.DONE: done,
+                entries.TERMINATED: done,
                 "info": {
                     "success": done & even,
                     "diverged": done & ~even,

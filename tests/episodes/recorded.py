@@ -8,7 +8,7 @@ from tensordict.nn import TensorDictModuleBase
 from softgm_bench.algorithms import build_algorithm
 from softgm_bench.assembly import build_env
 from softgm_bench.config import compose
-from softgm_bench.envs import keys
+from softgm_bench.envs import entries
 from softgm_bench.episodes import policy, trajectory
 
 WALL = ("task=wall", "task.wall_x=0.2")  # near enough to be touched by the arm's middle soon
@@ -18,13 +18,13 @@ SEEN = ("task=wall", "task.sensing_radius=0.4")  # near enough to be sensed befo
 class Leaning(TensorDictModuleBase):
     """Pushes towards +x, where the walls are, by torques that change with the arm's shape."""
 
-    in_keys = [keys.AGENT_POSITION]  # noqa: RUF012
-    out_keys = [keys.ACTION]  # noqa: RUF012
+    in_keys = [entries.AGENT_POSITION]  # noqa: RUF012
+    out_keys = [entries.ACTION]  # noqa: RUF012
 
     def forward(self, data):
-        place = data[keys.AGENT_POSITION]
+        place = data[entries.AGENT_POSITION]
         sideways = 0.1 * torch.sin(20.0 * place.sum(dim=-1))
-        return data.set(keys.ACTION, torch.stack([0.9 + sideways, sideways], dim=-1))
+        return data.set(entries.ACTION, torch.stack([0.9 + sideways, sideways], dim=-1))
 
 
 @cache

@@ -5,7 +5,7 @@ from counting_env import N_AGENTS, CountingEnv
 from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import exploration_type
 
-from softgm_bench.envs import keys, make_env
+from softgm_bench.envs import entries, make_env
 from softgm_bench.episodes.evaluation import evaluate, evaluate_in_parts, evaluation_seed
 from softgm_bench.episodes.summary import summarise, wilson_interval
 from softgm_bench.rod.dense import force_dense
@@ -19,7 +19,7 @@ def policy(seen=None):
             seen.append((tip.shape[0], exploration_type().name, torch.is_grad_enabled()))
         return torch.ones(*tip.shape[:-1], N_AGENTS, 2) * torch.rand(())
 
-    return TensorDictModule(act, in_keys=[keys.TIP], out_keys=[keys.ACTION])
+    return TensorDictModule(act, in_keys=[entries.TIP], out_keys=[entries.ACTION])
 
 
 def test_every_environment_counts_its_first_episode_and_no_more():
@@ -35,7 +35,7 @@ def test_every_environment_counts_its_first_episode_and_no_more():
 
 
 def test_torques_are_means_over_the_episodes_own_steps():
-    act = TensorDictModule(lambda tip: torch.ones(*tip.shape[:-1], N_AGENTS, 2), [keys.TIP], [keys.ACTION])
+    act = TensorDictModule(lambda tip: torch.ones(*tip.shape[:-1], N_AGENTS, 2), [entries.TIP], [entries.ACTION])
 
     records = evaluate(act, CountingEnv([2, 5]), deterministic=True, seed=0)
 
@@ -53,7 +53,7 @@ def test_ended_environments_cost_no_policy_evaluation_and_the_last_one_ends_the_
 
 def test_looking_only_now_and_then_whether_episodes_go_on_changes_no_record():
     def records():
-        act = TensorDictModule(lambda tip: torch.ones(*tip.shape[:-1], N_AGENTS, 2), [keys.TIP], [keys.ACTION])
+        act = TensorDictModule(lambda tip: torch.ones(*tip.shape[:-1], N_AGENTS, 2), [entries.TIP], [entries.ACTION])
         return evaluate(act, CountingEnv([3, 1, 20]), deterministic=True, seed=0).rows()
 
     expected = records()
@@ -106,7 +106,7 @@ def arm(settings, num_envs, seed):
 
 def test_an_arms_episode_is_the_sum_of_what_its_steps_say(settings):
     pushes = torch.tensor([[0.9, -0.2], [0.9, 0.4], [-0.9, 0.0]])[:, None].expand(3, 6, 2)
-    act = TensorDictModule(lambda tip: pushes, in_keys=[keys.TIP], out_keys=[keys.ACTION])
+    act = TensorDictModule(lambda tip: pushes, in_keys=[entries.TIP], out_keys=[entries.ACTION])
     records = evaluate(act, arm(settings, 3, 0), deterministic=True, seed=5)
     env = arm(settings, 3, 0)
     env.set_seed(5)
@@ -115,13 +115,13 @@ def test_an_arms_episode_is_the_sum_of_what_its_steps_say(settings):
     assert records.length.tolist() == [40, 40, 40]
     assert records.contact_steps.max() >= 3
     assert records.discovered_bins.max() > 3
-    np.testing.assert_array_equal(records.contact_steps, (frames[keys.CONTACT_NODES] > 0).sum((1, 2)))
-    np.testing.assert_array_equal(records.discovered_bins, frames[keys.DISCOVERED][:, -1, 0])
-    np.testing.assert_array_equal(records.dropped_bins, frames[keys.DROPPED][:, -1, 0])
+    np.testing.assert_array_equal(records.contact_steps, (frames[entries.CONTACT_NODES] > 0).sum((1, 2)))
+    np.testing.assert_array_equal(records.discovered_bins, frames[entries.DISCOVERED][:, -1, 0])
+    np.testing.assert_array_equal(records.dropped_bins, frames[entries.DROPPED][:, -1, 0])
     total = 0.0
-    for name in keys.REWARD_TERM_NAMES:
+    for name in entries.REWARD_TERM_NAMES:
         values = getattr(records, f"reward_{name}")
-        np.testing.assert_allclose(values, frames[keys.REWARD_TERMS, name].double().sum((1, 2)), rtol=1e-12)
+        np.testing.assert_allclose(values, frames[entries.REWARD_TERMS, name].double().sum((1, 2)), rtol=1e-12)
         total = total + values
     np.testing.assert_allclose(records.undiscounted_return, total, rtol=1e-6)
 
@@ -133,7 +133,7 @@ def test_parts_are_evaluations_with_seeds_of_their_own(settings):
         built.append((count, seed))
         return arm(settings, count, seed)
 
-    act = TensorDictModule(lambda tip: torch.ones(len(tip), 6, 2), in_keys=[keys.TIP], out_keys=[keys.ACTION])
+    act = TensorDictModule(lambda tip: torch.ones(len(tip), 6, 2), in_keys=[entries.TIP], out_keys=[entries.ACTION])
     together = evaluate_in_parts(act, build, 5, deterministic=True, seed=3, at_once=2)
     assert [count for count, _ in built] == [2, 2, 1]
     assert len({seed for _, seed in built}) == 3

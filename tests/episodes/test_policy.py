@@ -6,7 +6,7 @@ import torch
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from softgm_bench.config import UserError, compose
-from softgm_bench.envs import keys, make_env
+from softgm_bench.envs import entries, make_env
 from softgm_bench.episodes import policy
 from softgm_bench.runs import checkpoint
 from softgm_bench.runs.loop import train
@@ -41,7 +41,7 @@ def run(request, tmp_path_factory):
 def actions(trained):
     env = make_env(trained.config.task, trained.config.rod, num_envs=3, seed=1)
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        return env.rollout(3, trained.policy)[keys.ACTION]
+        return env.rollout(3, trained.policy)[entries.ACTION]
 
 
 def test_a_kept_policy_acts_as_the_runs_and_is_small(run, tmp_path):

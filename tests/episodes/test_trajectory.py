@@ -9,7 +9,7 @@ from recorded import SEEN, WALL, leaning, recorded, untrained, watched
 
 from softgm_bench.assembly import build_env
 from softgm_bench.config import UserError
-from softgm_bench.envs import keys
+from softgm_bench.envs import entries
 from softgm_bench.episodes import trajectory
 from softgm_bench.episodes.evaluation import evaluate_in_parts, evaluation_seed
 
@@ -48,7 +48,7 @@ def test_arrays_tell_the_same_as_observations_and_each_other():
     assert np.array_equal(seen["tip"], one.position[:, :, -1].astype(np.float32))
     assert np.array_equal(seen["agents/previous_action"][1:], one.action)
     assert np.array_equal(seen["target"], np.tile(one.target.astype(np.float32), (one.steps + 1, 1)))
-    assert set(one.reward_terms) == set(keys.REWARD_TERM_NAMES)
+    assert set(one.reward_terms) == set(entries.REWARD_TERM_NAMES)
     assert np.allclose(sum(one.reward_terms.values()), one.reward, atol=1e-5)
     length = np.linalg.norm(np.diff(one.position, axis=-1), axis=1)
     volume = np.pi * one.rod.base_radius**2 * one.rod.base_length / one.rod.n_elements

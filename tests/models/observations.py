@@ -4,7 +4,7 @@ import torch
 from hypothesis import strategies
 from tensordict import TensorDict
 
-from softgm_bench.envs import keys
+from softgm_bench.envs import entries
 from softgm_bench.models import ActorConfig, SoftGMConfig, ValueConfig
 
 SEEDS = strategies.integers(0, 2**31)
@@ -22,14 +22,14 @@ def observation(lead=(4,), n_agents=4, n_slots=6, seed=0, sensed=0.4, discovered
     active = torch.rand(*lead, n_slots, generator=generator) < discovered
     edge = (torch.rand(*lead, n_agents, n_slots, generator=generator) < sensed) & active.unsqueeze(-2)
     entries = {
-        keys.AGENT_POSITION: normal(n_agents, 3),
-        keys.AGENT_VELOCITY: normal(n_agents, 3),
-        keys.PREVIOUS_ACTION: normal(n_agents, 2).tanh(),
-        keys.EDGE: edge,
-        keys.SLOT_DESCRIPTOR: normal(n_slots, 9) * active.unsqueeze(-1),
-        keys.SLOT_ACTIVE: active,
-        keys.TIP: normal(3),
-        keys.TARGET: normal(3),
+        entries.AGENT_POSITION: normal(n_agents, 3),
+        entries.AGENT_VELOCITY: normal(n_agents, 3),
+        entries.PREVIOUS_ACTION: normal(n_agents, 2).tanh(),
+        entries.EDGE: edge,
+        entries.SLOT_DESCRIPTOR: normal(n_slots, 9) * active.unsqueeze(-1),
+        entries.SLOT_ACTIVE: active,
+        entries.TIP: normal(3),
+        entries.TARGET: normal(3),
     }
     td = TensorDict({}, batch_size=lead)
     for key, value in entries.items():

@@ -5,23 +5,23 @@ from hypothesis import given, settings
 from observations import LEADS, SEEDS, SIZES, observation
 from tensordict import TensorDict
 
-from softgm_bench.envs import keys
+from softgm_bench.envs import entries
 from softgm_bench.models import graph
 
 
 def by_hand():
     """Two agents, three slots; slot 1 is active and agent 1 senses it."""
     td = TensorDict({}, batch_size=())
-    td[keys.AGENT_POSITION] = torch.tensor([[1.0, 2, 3], [4, 5, 6]])
-    td[keys.AGENT_VELOCITY] = torch.tensor([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])
-    td[keys.PREVIOUS_ACTION] = torch.tensor([[-0.5, 0.5], [0.25, -0.25]])
-    td[keys.EDGE] = torch.tensor([[False, False, False], [False, True, False]])
+    td[entries.AGENT_POSITION] = torch.tensor([[1.0, 2, 3], [4, 5, 6]])
+    td[entries.AGENT_VELOCITY] = torch.tensor([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])
+    td[entries.PREVIOUS_ACTION] = torch.tensor([[-0.5, 0.5], [0.25, -0.25]])
+    td[entries.EDGE] = torch.tensor([[False, False, False], [False, True, False]])
     descriptor = torch.zeros(3, 9)
     descriptor[1] = torch.tensor([7.0, 8, 9, 0, 0, 1, 0.05, 1.2, 0.5])
-    td[keys.SLOT_DESCRIPTOR] = descriptor
-    td[keys.SLOT_ACTIVE] = torch.tensor([False, True, False])
-    td[keys.TIP] = torch.tensor([10.0, 20, 30])
-    td[keys.TARGET] = torch.tensor([100.0, 200, 300])
+    td[entries.SLOT_DESCRIPTOR] = descriptor
+    td[entries.SLOT_ACTIVE] = torch.tensor([False, True, False])
+    td[entries.TIP] = torch.tensor([10.0, 20, 30])
+    td[entries.TARGET] = torch.tensor([100.0, 200, 300])
     return td
 
 
@@ -68,8 +68,8 @@ def test_velocity_scale_changes_the_velocity_alone():
 @given(LEADS, SIZES, SEEDS)
 def test_pad_nodes_are_zero_whatever_their_descriptor(lead, sizes, seed):
     td = observation(lead, *sizes, seed=seed)
-    inactive = ~td[keys.SLOT_ACTIVE].unsqueeze(-1)
-    td[keys.SLOT_DESCRIPTOR] = torch.where(inactive, 3.0, td[keys.SLOT_DESCRIPTOR])
+    inactive = ~td[entries.SLOT_ACTIVE].unsqueeze(-1)
+    td[entries.SLOT_DESCRIPTOR] = torch.where(inactive, 3.0, td[entries.SLOT_DESCRIPTOR])
     features = graph.slot_features(td)
     assert features.shape == (*lead, sizes[1], 22)
     assert not (features * inactive).any()
@@ -102,7 +102,7 @@ def test_sense_gathers_every_edge_once_sorted_by_target(lead, sizes, seed):
     td = observation(lead, *sizes, seed=seed)
     n_agents, n_slots = sizes
     sensed = graph.sense(td)
-    edge = td[keys.EDGE].reshape(math.prod(lead), n_agents, n_slots)
+    edge = td[entries.EDGE].reshape(math.prod(lead), n_agents, n_slots)
     if sensed is None:
         assert not edge.any()
         return

@@ -3,7 +3,7 @@ import torch
 from observations import actor_config, observation, randomise, softgm_config, value_config
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from softgm_bench.envs import keys
+from softgm_bench.envs import entries
 from softgm_bench.models import MLPConfig, MLPEncoder, build_actor, build_value, graph
 from softgm_bench.models.heads import LOC, POOLINGS, SCALE, STATE_VALUE
 from softgm_bench.models.mlp import MLPTeamEncoder
@@ -22,10 +22,10 @@ def actor(encoder=None, seed=0, **changes):
 @pytest.mark.parametrize("lead", [(5,), (2, 3)])
 def test_shapes(encoder, lead):
     td = actor(encoder)(observation(lead))
-    assert td[keys.ACTION].shape == (*lead, 4, 2)
-    assert td[keys.LOG_PROB].shape == (*lead, 4)
+    assert td[entries.ACTION].shape == (*lead, 4, 2)
+    assert td[entries.LOG_PROB].shape == (*lead, 4)
     assert td[LOC].shape == td[SCALE].shape == (*lead, 4, 2)
-    assert (td[keys.ACTION].abs() <= 1).all()
+    assert (td[entries.ACTION].abs() <= 1).all()
     for pooling in POOLINGS:
         value = build_value(encoder, 4, 6, value_config(pooling=pooling))
         assert value(td)[STATE_VALUE].shape == (*lead, 1)
@@ -50,8 +50,8 @@ def test_the_ratio_of_an_unchanged_policy_is_one(mean, sigma):
     with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
         data = torch.cat([policy(observation((64,), seed=seed)) for seed in range(8)])
     data = data[torch.randperm(len(data))]  # minibatches are other batches than the rollout's
-    stored = data[keys.LOG_PROB].clone()
-    ratio = (policy.get_dist(data).log_prob(data[keys.ACTION]) - stored).exp()
+    stored = data[entries.LOG_PROB].clone()
+    ratio = (policy.get_dist(data).log_prob(data[entries.ACTION]) - stored).exp()
     assert (ratio - 1).abs().max() < 1e-5
 
 
@@ -64,7 +64,7 @@ def test_gradients_are_finite(mean, state_dependent_sigma):
         data = policy(observation((64,)))
     dist = policy.get_dist(data)
     _, pathwise = dist.rsample_and_log_prob()
-    (dist.log_prob(data[keys.ACTION]).sum() + pathwise.sum()).backward()
+    (dist.log_prob(data[entries.ACTION]).sum() + pathwise.sum()).backward()
     for name, parameter in policy.named_parameters():
         assert parameter.grad is not None, name
         assert parameter.grad.isfinite().all(), name
@@ -75,11 +75,11 @@ def test_it_is_deterministic_only_when_told_so():
 
     def act(exploration):
         with set_exploration_type(exploration):
-            return policy(td.clone())[keys.ACTION]
+            return policy(td.clone())[entries.ACTION]
 
     assert torch.equal(act(ExplorationType.DETERMINISTIC), act(ExplorationType.DETERMINISTIC))
     assert not torch.equal(act(ExplorationType.RANDOM), act(ExplorationType.RANDOM))
-    assert not torch.equal(policy(td.clone())[keys.ACTION], policy(td.clone())[keys.ACTION])
+    assert not torch.equal(policy(td.clone())[entries.ACTION], policy(td.clone())[entries.ACTION])
     loc = policy(td)[LOC]
     torch.testing.assert_close(act(ExplorationType.DETERMINISTIC), (3 * (loc / 3).tanh()).tanh())
 
@@ -105,10 +105,10 @@ def test_an_initial_sigma_outside_its_bounds_is_refused():
 def test_a_slot_without_an_edge_changes_no_bit_of_any_action():
     policy, td = randomise(actor()), observation((9,))
     changed = td.clone()
-    unsensed = ~td[keys.EDGE].any(dim=-2, keepdim=True).mT
-    changed[keys.SLOT_DESCRIPTOR] = torch.where(unsensed, 5.0, td[keys.SLOT_DESCRIPTOR])
+    unsensed = ~td[entries.EDGE].any(dim=-2, keepdim=True).mT
+    changed[entries.SLOT_DESCRIPTOR] = torch.where(unsensed, 5.0, td[entries.SLOT_DESCRIPTOR])
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        assert torch.equal(policy(td)[keys.ACTION], policy(changed)[keys.ACTION])
+        assert torch.equal(policy(td)[entries.ACTION], policy(changed)[entries.ACTION])
 
 
 def test_the_value_pools_the_agents_mean():
@@ -142,11 +142,11 @@ def test_a_centralised_critic_sees_every_agent(encoder, pooling):
     for agent in range(4):
         td = observation((5,))
         before = value(td.clone())[STATE_VALUE]
-        td[keys.AGENT_VELOCITY][:, agent] += 1.0
+        td[entries.AGENT_VELOCITY][:, agent] += 1.0
         assert not torch.isclose(before, value(td)[STATE_VALUE]).any()
 
 
-OWN = (keys.AGENT_POSITION, keys.AGENT_VELOCITY, keys.PREVIOUS_ACTION, keys.EDGE)
+OWN = (entries.AGENT_POSITION, entries.AGENT_VELOCITY, entries.PREVIOUS_ACTION, entries.EDGE)
 
 
 @pytest.mark.parametrize("moved", range(4))
@@ -158,7 +158,7 @@ def test_an_independent_critic_sees_of_each_agent_what_its_actor_sees(entry, mov
         value = randomise(build_value(encoder, 4, 6, value_config(), centralised=False)).double()
         td = observation((5,), sensed=0.6, discovered=1.0, dtype=torch.float64)
         other = td.clone()
-        other[entry][:, moved] = ~td[entry][:, moved] if entry == keys.EDGE else td[entry][:, moved] + 1.0
+        other[entry][:, moved] = ~td[entry][:, moved] if entry == entries.EDGE else td[entry][:, moved] + 1.0
         difference = (value(td)[STATE_VALUE] - value(other)[STATE_VALUE]).abs().squeeze(-1)
         changed = (difference > 1e-12).any(dim=0).tolist()
         assert changed == [abs(agent - moved) <= reach for agent in range(4)]
@@ -167,9 +167,9 @@ def test_an_independent_critic_sees_of_each_agent_what_its_actor_sees(entry, mov
 def test_privileged_channels_enter_the_heads_that_are_built_for_them_and_no_other():
     torch.manual_seed(0)
     td = observation((5,))
-    td[keys.PRIVILEGED] = torch.randn(5, 3)
+    td[entries.PRIVILEGED] = torch.randn(5, 3)
     other = td.clone()
-    other[keys.PRIVILEGED] = td[keys.PRIVILEGED] + 1.0
+    other[entries.PRIVILEGED] = td[entries.PRIVILEGED] + 1.0
 
     def same(build, key):
         network = randomise(build)
@@ -178,11 +178,11 @@ def test_privileged_channels_enter_the_heads_that_are_built_for_them_and_no_othe
 
     for known in (0, 3):
         network = build_actor(softgm_config(), 4, 6, actor_config(), n_privileged=known)
-        assert (keys.PRIVILEGED in network.in_keys) is bool(known)
+        assert (entries.PRIVILEGED in network.in_keys) is bool(known)
         assert same(network, LOC) is not bool(known)
         for centralised, pooling in ((True, "mean"), (True, "concat"), (False, "mean")):
             value = build_value(softgm_config(), 4, 6, value_config(pooling=pooling), centralised, known)
-            assert (keys.PRIVILEGED in value.in_keys) is bool(known)
+            assert (entries.PRIVILEGED in value.in_keys) is bool(known)
             assert same(value, STATE_VALUE) is not bool(known)
 
 
@@ -200,7 +200,7 @@ def test_persistence_mixes_the_previous_action_into_the_mean():
     plain, persistent = actor(), actor(persistence=0.75)
     data = observation((7,))
     loc = plain(data.clone())[LOC]
-    previous = data[keys.PREVIOUS_ACTION].clamp(-0.99, 0.99).atanh()
+    previous = data[entries.PREVIOUS_ACTION].clamp(-0.99, 0.99).atanh()
     torch.testing.assert_close(persistent(data.clone())[LOC], 0.25 * loc + 0.75 * previous)
     with pytest.raises(ValueError, match=r"persistence is 1\.0"):
         actor(persistence=1.0)

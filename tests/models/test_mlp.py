@@ -2,7 +2,7 @@ import torch
 from hypothesis import given, settings
 from observations import LEADS, SEEDS, SIZES, observation, randomise
 
-from softgm_bench.envs import keys
+from softgm_bench.envs import entries
 from softgm_bench.models import MLPConfig, MLPEncoder, graph
 from softgm_bench.models.mlp import MLPTeamEncoder
 
@@ -23,7 +23,9 @@ def test_it_knows_undiscovered_slots_by_nothing():
     model = MLPEncoder(MLPConfig(hidden=7, layers=1, velocity_scale=0.5), 4, 6)
     td = observation((5,), 4, 6)
     changed = td.clone()
-    changed[keys.SLOT_DESCRIPTOR] = torch.where(td[keys.SLOT_ACTIVE].unsqueeze(-1), td[keys.SLOT_DESCRIPTOR], 9.0)
+    changed[entries.SLOT_DESCRIPTOR] = torch.where(
+        td[entries.SLOT_ACTIVE].unsqueeze(-1), td[entries.SLOT_DESCRIPTOR], 9.0
+    )
     assert torch.equal(model(td), model(changed))
 
 

@@ -5,7 +5,7 @@ import torch
 from hypothesis import given, settings
 from observations import LEADS, SEEDS, SIZES, observation, randomise, softgm_config
 
-from softgm_bench.envs import keys
+from softgm_bench.envs import entries
 from softgm_bench.models import SoftGMEncoder
 
 SWITCHES = [
@@ -68,12 +68,12 @@ def test_slots_without_an_edge_change_no_bit(sizes, seed):
     model = encoder(seed=seed)
     td = observation((5,), *sizes, seed=seed)
     other = observation((5,), *sizes, seed=seed + 1)
-    unsensed = ~td[keys.EDGE].any(dim=-2)
+    unsensed = ~td[entries.EDGE].any(dim=-2)
     changed = td.clone()
-    changed[keys.SLOT_DESCRIPTOR] = torch.where(
-        unsensed.unsqueeze(-1), other[keys.SLOT_DESCRIPTOR], td[keys.SLOT_DESCRIPTOR]
+    changed[entries.SLOT_DESCRIPTOR] = torch.where(
+        unsensed.unsqueeze(-1), other[entries.SLOT_DESCRIPTOR], td[entries.SLOT_DESCRIPTOR]
     )
-    changed[keys.SLOT_ACTIVE] = torch.where(unsensed, other[keys.SLOT_ACTIVE], td[keys.SLOT_ACTIVE])
+    changed[entries.SLOT_ACTIVE] = torch.where(unsensed, other[entries.SLOT_ACTIVE], td[entries.SLOT_ACTIVE])
     assert torch.equal(model(td), model(changed))
 
 
@@ -84,9 +84,9 @@ def test_relabelling_slots_changes_nothing(sizes, seed):
     td = observation((5,), *sizes, seed=seed, dtype=torch.float64)
     order = torch.randperm(sizes[1])
     relabelled = td.clone()
-    relabelled[keys.EDGE] = td[keys.EDGE][..., order]
-    relabelled[keys.SLOT_DESCRIPTOR] = td[keys.SLOT_DESCRIPTOR][..., order, :]
-    relabelled[keys.SLOT_ACTIVE] = td[keys.SLOT_ACTIVE][..., order]
+    relabelled[entries.EDGE] = td[entries.EDGE][..., order]
+    relabelled[entries.SLOT_DESCRIPTOR] = td[entries.SLOT_DESCRIPTOR][..., order, :]
+    relabelled[entries.SLOT_ACTIVE] = td[entries.SLOT_ACTIVE][..., order]
     torch.testing.assert_close(model(td), model(relabelled), rtol=1e-12, atol=1e-12)
 
 
@@ -103,7 +103,7 @@ def test_a_batch_of_one_equals_a_batch_of_many(sizes, seed):
 def test_no_edge_at_all_equals_no_slots():
     model = encoder()
     empty, without = observation((3,), 4, 6, sensed=0.0), observation((3,), 4, 0, sensed=0.0)
-    for key in (keys.AGENT_POSITION, keys.AGENT_VELOCITY, keys.PREVIOUS_ACTION, keys.TIP, keys.TARGET):
+    for key in (entries.AGENT_POSITION, entries.AGENT_VELOCITY, entries.PREVIOUS_ACTION, entries.TIP, entries.TARGET):
         without[key] = empty[key]
     assert torch.equal(model(empty), model(without))
 
@@ -111,17 +111,19 @@ def test_no_edge_at_all_equals_no_slots():
 def test_an_edge_matters_only_with_stage_one():
     td = observation((3,), 4, 6, sensed=1.0, discovered=1.0)
     blind = td.clone()
-    blind[keys.EDGE] = torch.zeros_like(td[keys.EDGE])
+    blind[entries.EDGE] = torch.zeros_like(td[entries.EDGE])
     assert not torch.allclose(encoder()(td), encoder()(blind))
     assert torch.equal(encoder(stage1=False)(td), encoder(stage1=False)(blind))
 
 
-@pytest.mark.parametrize("entry", [keys.AGENT_POSITION, keys.AGENT_VELOCITY, keys.PREVIOUS_ACTION, keys.EDGE])
+@pytest.mark.parametrize(
+    "entry", [entries.AGENT_POSITION, entries.AGENT_VELOCITY, entries.PREVIOUS_ACTION, entries.EDGE]
+)
 @pytest.mark.parametrize("moved", range(6))
 def test_an_agent_reaches_as_many_neighbours_as_stage_two_has_layers(entry, moved):
     td = observation((3,), 6, 5, sensed=0.5, discovered=1.0)
     other = td.clone()
-    other[entry][:, moved] = ~td[entry][:, moved] if entry == keys.EDGE else td[entry][:, moved] + 1
+    other[entry][:, moved] = ~td[entry][:, moved] if entry == entries.EDGE else td[entry][:, moved] + 1
     for layers in (1, 2):
         model = encoder(torch.float64, layers=layers)
         changed = ((model(td.double()) - model(other.double())).abs() > 1e-13).any(dim=-1).any(dim=0)
@@ -131,13 +133,13 @@ def test_an_agent_reaches_as_many_neighbours_as_stage_two_has_layers(entry, move
 def test_without_stage_two_an_agent_hears_no_agent():
     td = observation((3,), 6, 5)
     other = td.clone()
-    other[keys.AGENT_POSITION][:, 2] += 1
+    other[entries.AGENT_POSITION][:, 2] += 1
     model = encoder(stage2=False)
     same = (model(td) == model(other)).all(dim=-1).all(dim=0)
     assert same.tolist() == [True, True, False, True, True, True]
 
 
-@pytest.mark.parametrize("entry", [keys.TIP, keys.TARGET])
+@pytest.mark.parametrize("entry", [entries.TIP, entries.TARGET])
 def test_tip_and_target_are_shared_by_all_agents(entry):
     td = observation((3,), 6, 5)
     other = td.clone()

@@ -9,7 +9,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from softgm_bench.algorithms import algorithm_configs, build_algorithm
 from softgm_bench.config import compose
-from softgm_bench.envs import keys, make_env
+from softgm_bench.envs import entries, make_env
 from softgm_bench.rod.parameters import RodParameters
 from softgm_bench.runs import checkpoint
 from softgm_bench.runs.loop import train
@@ -109,25 +109,25 @@ def scene(env):
     torch.manual_seed(1)
     td = env.reset()
     td.update(env.observation_spec.rand())
-    td[keys.EDGE] &= td[keys.SLOT_ACTIVE].unsqueeze(-2) & (torch.rand(td[keys.EDGE].shape) < 0.1)
+    td[entries.EDGE] &= td[entries.SLOT_ACTIVE].unsqueeze(-2) & (torch.rand(td[entries.EDGE].shape) < 0.1)
     return td
 
 
 def act(policy, td, exploration=ExplorationType.DETERMINISTIC):
     torch.manual_seed(2)
     with torch.no_grad(), set_exploration_type(exploration):
-        return policy(td.clone())[keys.ACTION]
+        return policy(td.clone())[entries.ACTION]
 
 
 @pytest.mark.parametrize(("algo", "model"), PAIRS)
 def test_every_policy_reads_the_observation_and_nothing_else(algo, model, wall):
     policy, td = built(algo, model, wall).policy, scene(wall)
-    observed = td.select(*keys.OBSERVATION)
-    assert set(policy.in_keys) == set(keys.OBSERVATION)
-    assert len(td.keys(include_nested=True, leaves_only=True)) > len(keys.OBSERVATION)
+    observed = td.select(*entries.OBSERVATION)
+    assert set(policy.in_keys) == set(entries.OBSERVATION)
+    assert len(td.keys(include_nested=True, leaves_only=True)) > len(entries.OBSERVATION)
     for exploration in (ExplorationType.DETERMINISTIC, ExplorationType.RANDOM):
         assert torch.equal(act(policy, td, exploration), act(policy, observed, exploration))
-    for key in (keys.TARGET, keys.AGENT_POSITION):  # and this it does read
+    for key in (entries.TARGET, entries.AGENT_POSITION):  # and this it does read
         other = observed.clone()
         other[key] += 1.0
         assert not torch.equal(act(policy, observed), act(policy, other))
@@ -137,8 +137,8 @@ def test_every_policy_reads_the_observation_and_nothing_else(algo, model, wall):
 def test_no_policy_reads_what_its_asymmetric_critic_is_told(algo, wall):
     policy, td = built(algo, "softgm", wall, "algo.critic.asymmetric=true").policy, scene(wall)
     other = td.clone()
-    other[keys.PRIVILEGED] += 1.0
-    assert set(policy.in_keys) == set(keys.OBSERVATION)
+    other[entries.PRIVILEGED] += 1.0
+    assert set(policy.in_keys) == set(entries.OBSERVATION)
     assert torch.equal(act(policy, td), act(policy, other))
 
 
@@ -147,11 +147,11 @@ def test_no_policy_reads_what_its_asymmetric_critic_is_told(algo, wall):
 def test_execution_is_decentralised(algo, model, moved, wall):
     """An agent acts on its own entries and, with SoftGM, on those of agents at most L = 2 places away."""
     policy, td = built(algo, model, wall).policy.double(), scene(wall)
-    td = td.select(*keys.OBSERVATION).apply(lambda entry: entry.double() if entry.is_floating_point() else entry)
+    td = td.select(*entries.OBSERVATION).apply(lambda entry: entry.double() if entry.is_floating_point() else entry)
     other = td.clone()
-    for key in (keys.AGENT_POSITION, keys.AGENT_VELOCITY, keys.PREVIOUS_ACTION):
+    for key in (entries.AGENT_POSITION, entries.AGENT_VELOCITY, entries.PREVIOUS_ACTION):
         other[key][:, moved] = td[key][:, moved] * 0.5 + 0.1
-    other[keys.EDGE][:, moved] = td[keys.SLOT_ACTIVE] & ~td[keys.EDGE][:, moved]
+    other[entries.EDGE][:, moved] = td[entries.SLOT_ACTIVE] & ~td[entries.EDGE][:, moved]
     changed = ((act(policy, td) - act(policy, other)).abs() > 1e-11).any(dim=-1).any(dim=0).tolist()
     reach = 2 if model == "softgm" and algo != "softgm_no_stage2" else 0
     assert changed == [abs(agent - moved) <= reach for agent in range(6)]

@@ -9,7 +9,9 @@ import torch
 
 from softgm_bench.config import UserError, compose
 from softgm_bench.runs import checkpoint
-from softgm_bench.runs.loop import derive_seeds, set_threads, train
+from softgm_bench.runs.loop import train
+from softgm_bench.runs.machine import set_threads
+from softgm_bench.runs.run import derive_seeds
 
 TINY = (
     "experiment=smoke",
@@ -157,7 +159,7 @@ def test_threads_are_set_everywhere():
 
 def test_a_fresh_process_uses_the_threads_that_it_is_told_to():
     """Numba starts its threads when it is first asked for some, and tells torch how many."""
-    code = "import torch; from softgm_bench.runs.loop import set_threads; set_threads(1)"
+    code = "import torch; from softgm_bench.runs.machine import set_threads; set_threads(1)"
     command = [sys.executable, "-c", f"{code}; print(torch.get_num_threads())"]
     assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == "1\n"
 

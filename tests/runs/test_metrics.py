@@ -5,14 +5,14 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from softgm_bench.envs import keys
+from softgm_bench.envs import entries
 from softgm_bench.runs.metrics import CsvWriter, EpisodeTracker, step_metrics
 
 
 def batch(reward, done, success):
     reward, done, success = (torch.tensor(values).unsqueeze(-1) for values in (reward, done, success))
-    after = TensorDict({keys.REWARD: reward.float(), keys.DONE: done.bool()}, reward.shape[:2])
-    after[keys.SUCCESS], after[keys.DIVERGED] = success.bool(), (done.bool() & ~success.bool())
+    after = TensorDict({entries.REWARD: reward.float(), entries.DONE: done.bool()}, reward.shape[:2])
+    after[entries.SUCCESS], after[entries.DIVERGED] = success.bool(), (done.bool() & ~success.bool())
     return TensorDict({"next": after}, after.batch_size)
 
 
@@ -36,15 +36,22 @@ def test_without_a_finished_episode_the_means_are_nan():
 
 def test_every_reward_term_has_a_column():
     after = TensorDict({}, [2, 3])
-    for index, name in enumerate(keys.REWARD_TERM_NAMES):
-        after[keys.REWARD_TERMS, name] = torch.full((2, 3, 1), float(index))
-    infos = (keys.DISTANCE, keys.CONTACT_NODES, keys.DISCOVERED, keys.TORQUE_PER_AGENT, keys.TORQUE_JOINT, keys.DROPPED)
+    for index, name in enumerate(entries.REWARD_TERM_NAMES):
+        after[entries.REWARD_TERMS, name] = torch.full((2, 3, 1), float(index))
+    infos = (
+        entries.DISTANCE,
+        entries.CONTACT_NODES,
+        entries.DISCOVERED,
+        entries.TORQUE_PER_AGENT,
+        entries.TORQUE_JOINT,
+        entries.DROPPED,
+    )
     for key in infos:
         after[key] = torch.arange(6.0).view(2, 3, 1)
 
     row = step_metrics(TensorDict({"next": after}, [2, 3]))
 
-    assert [row[f"reward_{name}"] for name in keys.REWARD_TERM_NAMES] == list(range(8))
+    assert [row[f"reward_{name}"] for name in entries.REWARD_TERM_NAMES] == list(range(8))
     assert row["discovered_bins"] == 2.5
     assert row["dropped_bins"] == 5.0
     assert "difficulty" not in row
@@ -52,12 +59,19 @@ def test_every_reward_term_has_a_column():
 
 def test_difficulty_has_a_column_where_there_is_a_curriculum():
     after = TensorDict({}, [2, 3])
-    for name in keys.REWARD_TERM_NAMES:
-        after[keys.REWARD_TERMS, name] = torch.zeros(2, 3, 1)
-    infos = (keys.DISTANCE, keys.CONTACT_NODES, keys.DISCOVERED, keys.TORQUE_PER_AGENT, keys.TORQUE_JOINT, keys.DROPPED)
+    for name in entries.REWARD_TERM_NAMES:
+        after[entries.REWARD_TERMS, name] = torch.zeros(2, 3, 1)
+    infos = (
+        entries.DISTANCE,
+        entries.CONTACT_NODES,
+        entries.DISCOVERED,
+        entries.TORQUE_PER_AGENT,
+        entries.TORQUE_JOINT,
+        entries.DROPPED,
+    )
     for key in infos:
         after[key] = torch.zeros(2, 3, 1)
-    after[keys.DIFFICULTY] = torch.linspace(0.0, 1.0, 6).view(2, 3, 1)
+    after[entries.DIFFICULTY] = torch.linspace(0.0, 1.0, 6).view(2, 3, 1)
     assert step_metrics(TensorDict({"next": after}, [2, 3]))["difficulty"] == pytest.approx(0.5)
 
 

@@ -18,9 +18,8 @@ from tensordict import TensorDictBase
 
 from softgm_bench import plugins
 from softgm_bench.config import UserError, compose, dtype_of
-from softgm_bench.envs import keys, make_env
+from softgm_bench.envs import entries, make_env
 from softgm_bench.envs.soft_arm import SoftArmEnv
-from softgm_bench.envs.specs import INFO
 from softgm_bench.envs.tasks import TASKS
 
 try:
@@ -33,7 +32,6 @@ except ImportError as error:
 
 Array = NDArray[Any]
 SETTINGS = ("task", "rod", "perturbation", "device", "backend", "dtype")  # what an environment alone depends on
-FLAGS = (keys.SUCCESS, keys.DIVERGED)
 
 
 def build_arm(
@@ -98,14 +96,14 @@ def checked_seed(seed: int) -> int:
 
 
 def joint_view(td: TensorDictBase) -> Array:
-    """``keys.OBSERVATION`` one after another, row by row, ``(num_envs, joint_size(env))`` float32."""
-    parts = [td[key].reshape(td.batch_size[0], -1).to(torch.float32) for key in keys.OBSERVATION]
+    """``entries.OBSERVATION`` one after another, row by row, ``(num_envs, joint_size(env))`` float32."""
+    parts = [td[key].reshape(td.batch_size[0], -1).to(torch.float32) for key in entries.OBSERVATION]
     return torch.cat(parts, dim=-1).cpu().numpy()
 
 
 def joint_size(env: SoftArmEnv) -> int:
     """Length of the joint observation."""
-    return sum(math.prod(env.observation_spec[key].shape[1:]) for key in keys.OBSERVATION)
+    return sum(math.prod(env.observation_spec[key].shape[1:]) for key in entries.OBSERVATION)
 
 
 def real_space(*shape: int) -> spaces.Box:
@@ -115,7 +113,7 @@ def real_space(*shape: int) -> spaces.Box:
 
 def action_size(env: SoftArmEnv) -> int:
     """Length of the joint action."""
-    return math.prod(env.action_spec[keys.ACTION].shape[1:])
+    return math.prod(env.action_spec[entries.ACTION].shape[1:])
 
 
 def checked_action(action: Any, shape: tuple[int, ...]) -> Array:
@@ -135,16 +133,20 @@ def checked_action(action: Any, shape: tuple[int, ...]) -> Array:
 def put_action(td: TensorDictBase, action: Array, env: SoftArmEnv) -> TensorDictBase:
     """Write a joint action of all environments, in any shape, to what the environment's step reads."""
     joint = torch.tensor(action, device=env.device)
-    return td.set(keys.ACTION, joint.reshape(env.action_spec[keys.ACTION].shape))
+    return td.set(entries.ACTION, joint.reshape(env.action_spec[entries.ACTION].shape))
+
+
+def ends(td: TensorDictBase) -> tuple[float, bool, bool]:
+    """Give reward, terminated and truncated of one environment's step."""
+    return td[entries.REWARD].item(), td[entries.TERMINATED].item(), td[entries.TRUNCATED].item()
 
 
 def info_columns(td: TensorDictBase) -> dict[str, Array]:
     """Everything under ``info`` by name, reward terms as ``reward_<name>``: ``(num_envs,)`` bool or float64 each."""
-    named = {key[1]: key for key in INFO} | {
-        f"reward_{name}": (keys.REWARD_TERMS, name) for name in keys.REWARD_TERM_NAMES
-    }
+    named = {key[1]: key for key in entries.INFO}
+    named |= {f"reward_{name}": (entries.REWARD_TERMS, name) for name in entries.REWARD_TERM_NAMES}
     columns = {name: td[key].squeeze(-1).cpu().numpy() for name, key in named.items()}
-    return {name: column.astype(bool if named[name] in FLAGS else np.float64) for name, column in columns.items()}
+    return {name: column if column.dtype == bool else column.astype(np.float64) for name, column in columns.items()}
 
 
 def info_row(columns: Mapping[str, Array], row: int) -> dict[str, Any]:
@@ -173,9 +175,7 @@ class SoftArmGymnasiumEnv(gymnasium.Env[Array, Array]):
         _refuse_rendering(render_mode)
         self._arm = build_arm(task, 1, seed, horizon, overrides)
         self.observation_space = real_space(joint_size(self._arm))
-        self.action_space = spaces.Box(
-            -1.0, 1.0, (math.prod(self._arm.action_spec[keys.ACTION].shape[1:]),), np.float32
-        )
+        self.action_space = spaces.Box(-1.0, 1.0, (action_size(self._arm),), np.float32)
         self._td: TensorDictBase | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
@@ -192,7 +192,7 @@ class SoftArmGymnasiumEnv(gymnasium.Env[Array, Array]):
             raise ValueError("step before the first reset: call reset()")
         checked = checked_action(action, (action_size(self._arm),))
         self._td = td = self._arm.step(put_action(self._td, checked, self._arm))["next"]
-        reward, terminated, truncated = (td[key].item() for key in (keys.REWARD, keys.TERMINATED, keys.TRUNCATED))
+        reward, terminated, truncated = ends(td)
         return joint_view(td)[0], reward, terminated, truncated, info_row(info_columns(td), 0)
 
 
@@ -243,7 +243,7 @@ class SoftArmVectorEnv(VectorEnv[Array, Array, Array]):
         frame, self._td = self._arm.step_and_maybe_reset(put_action(self._td, checked, self._arm))
         last = frame["next"]
         reward, terminated, truncated = (
-            last[key].squeeze(-1).cpu().numpy() for key in (keys.REWARD, keys.TERMINATED, keys.TRUNCATED)
+            last[key].squeeze(-1).cpu().numpy() for key in (entries.REWARD, entries.TERMINATED, entries.TRUNCATED)
         )
         done = terminated | truncated
         infos = _masked(info_columns(self._td), np.ones_like(done))

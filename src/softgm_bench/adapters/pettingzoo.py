@@ -11,9 +11,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded
 
-from softgm_bench.envs import keys
+from softgm_bench.envs import entries
 from softgm_bench.envs.soft_arm import SoftArmEnv
-from softgm_bench.envs.specs import DIRECTIONS
 from softgm_bench.envs.views import flat_features, flat_observation
 
 try:
@@ -25,6 +24,7 @@ try:
         build_arm,
         checked_action,
         checked_seed,
+        ends,
         info_columns,
         info_row,
         joint_size,
@@ -88,10 +88,9 @@ class _Film:
 
     def step(self, td: TensorDictBase) -> None:
         """Note what a step led to."""
-        force = self._arm.tip_force
         self._steps["action"].append(_first_row(self._arm.applied_action))
-        self._steps["tip_force"].append(np.zeros(3) if force is None else _first_row(force).astype(np.float64))
-        self._steps["reward"].append(_first_row(td[keys.REWARD])[0])
+        self._steps["tip_force"].append(_first_row(self._arm.tip_force).astype(np.float64))
+        self._steps["reward"].append(_first_row(td[entries.REWARD])[0])
         self._td = td
         self._note_state(td)
 
@@ -114,7 +113,7 @@ class _Film:
         rod = self._arm.rod
         now = {name: getattr(rod, name) for name in ("position", "director", "velocity", "omega")}
         now |= {"contact": self._arm.contacts()}
-        now |= {"slots/active": td[keys.SLOT_ACTIVE], "slots/descriptor": td[keys.SLOT_DESCRIPTOR]}
+        now |= {"slots/active": td[entries.SLOT_ACTIVE], "slots/descriptor": td[entries.SLOT_DESCRIPTOR]}
         for name, values in now.items():
             self._states.setdefault(name, []).append(_first_row(values))
 
@@ -126,7 +125,7 @@ class _Film:
         exists = _first_row(cylinders.mask)
         states = {name: np.stack(values) for name, values in self._states.items()}
         steps = len(self._steps["reward"])
-        shapes = {"action": (steps, arm.n_agents, DIRECTIONS), "tip_force": (steps, 3), "reward": (steps,)}
+        shapes = {"action": (steps, arm.sizes.n_agents, arm.sizes.action), "tip_force": (steps, 3), "reward": (steps,)}
         return Trajectory(
             observation={name: states.pop(name) for name in tuple(states) if "/" in name},
             **states,
@@ -135,8 +134,8 @@ class _Film:
             reward_terms={},
             cylinders={name: _first_row(getattr(cylinders, name))[exists].astype(float) for name in CYLINDER_FIELDS},
             attention={},
-            success=bool(self._td[keys.SUCCESS]),
-            diverged=bool(self._td[keys.DIVERGED]),
+            success=bool(self._td[entries.SUCCESS]),
+            diverged=bool(self._td[entries.DIVERGED]),
             config={"rod": asdict(arm.backend.parameters), "task": asdict(arm.task.config)},
             info={},
         )
@@ -164,11 +163,12 @@ class SoftArmParallelEnv(ParallelEnv[str, Observation, Array]):
             "render_fps": 1.0 / arm.backend.parameters.control_dt,
             "is_parallelizable": True,
         }
-        self.possible_agents = [f"section_{index}" for index in range(arm.n_agents)]
+        self.possible_agents = [f"section_{index}" for index in range(arm.sizes.n_agents)]
         self.agents: list[str] = []
         space, self._observe = _VIEWS[observation]
         self.observation_spaces = {agent: space(arm) for agent in self.possible_agents}
-        self.action_spaces = {agent: spaces.Box(-1.0, 1.0, (DIRECTIONS,), np.float32) for agent in self.possible_agents}
+        own = (arm.sizes.action,)
+        self.action_spaces = {agent: spaces.Box(-1.0, 1.0, own, np.float32) for agent in self.possible_agents}
         self.state_space = real_space(joint_size(arm))
         self._film = None if render_mode is None else _Film(arm)
         self._td: TensorDictBase | None = None
@@ -205,11 +205,11 @@ class SoftArmParallelEnv(ParallelEnv[str, Observation, Array]):
             raise ValueError("step outside of an episode: call reset()")
         if set(actions) != set(self.agents):
             raise ValueError(f"actions are of {', '.join(map(str, actions))}: they must be of {', '.join(self.agents)}")
-        joint = np.stack([checked_action(actions[agent], (DIRECTIONS,)) for agent in self.agents])
+        joint = np.stack([checked_action(actions[agent], (self.arm.sizes.action,)) for agent in self.agents])
         self._td = td = self.arm.step(put_action(self._td, joint, self.arm))["next"]
         if self._film is not None:
             self._film.step(td)
-        reward, terminated, truncated = (td[key].item() for key in (keys.REWARD, keys.TERMINATED, keys.TRUNCATED))
+        reward, terminated, truncated = ends(td)
         if terminated or truncated:
             self.agents = []
         every = self.possible_agents
@@ -222,7 +222,7 @@ class SoftArmParallelEnv(ParallelEnv[str, Observation, Array]):
         )
 
     def state(self) -> Array:
-        """For centralised critics: the entries of ``keys.OBSERVATION`` one after another, float32."""
+        """For centralised critics: the entries of ``entries.OBSERVATION`` one after another, float32."""
         return joint_view(self._frame())[0]
 
     def render(self) -> Array | None:
@@ -252,7 +252,7 @@ class SoftArmParallelEnv(ParallelEnv[str, Observation, Array]):
 
 
 def _flat_space(arm: SoftArmEnv) -> spaces.Box:
-    return real_space(flat_features(arm.n_slots))
+    return real_space(flat_features(arm.sizes.n_slots))
 
 
 def _flat_rows(td: TensorDictBase) -> list[Observation]:
@@ -261,29 +261,34 @@ def _flat_rows(td: TensorDictBase) -> list[Observation]:
 
 def _dict_space(arm: SoftArmEnv) -> spaces.Dict:
     """Spaces of ``_dict_rows``; those of slots are absent where a task has none."""
-    acted = arm.observation_spec[keys.PREVIOUS_ACTION]
+    acted = arm.observation_spec[entries.PREVIOUS_ACTION]
     bounded = isinstance(acted, Bounded)  # noise goes beyond
-    entries: dict[str, spaces.Space] = {
+    own = (arm.sizes.action,)
+    found: dict[str, spaces.Space] = {
         "position": real_space(3),
         "velocity": real_space(3),
-        "previous_action": spaces.Box(-1.0, 1.0, (DIRECTIONS,), np.float32) if bounded else real_space(DIRECTIONS),
+        "previous_action": spaces.Box(-1.0, 1.0, own, np.float32) if bounded else real_space(*own),
         "tip": real_space(3),
         "target": real_space(3),
     }
-    if arm.n_slots:
-        entries["slot_descriptor"] = real_space(*arm.observation_spec[keys.SLOT_DESCRIPTOR].shape[1:])
-        entries["slot_active"] = spaces.MultiBinary(arm.n_slots)
-        entries["edge"] = spaces.MultiBinary(arm.n_slots)
-    return spaces.Dict(entries)
+    if arm.sizes.n_slots:
+        found["slot_descriptor"] = real_space(*arm.observation_spec[entries.SLOT_DESCRIPTOR].shape[1:])
+        found["slot_active"] = spaces.MultiBinary(arm.sizes.n_slots)
+        found["edge"] = spaces.MultiBinary(arm.sizes.n_slots)
+    return spaces.Dict(found)
 
 
 def _dict_rows(td: TensorDictBase) -> list[Observation]:
-    """The entries of ``keys.OBSERVATION``, of the agents' own each agent's row; arrays that nothing else refers to."""
-    own = {"position": keys.AGENT_POSITION, "velocity": keys.AGENT_VELOCITY, "previous_action": keys.PREVIOUS_ACTION}
-    shared: dict[str, Any] = {"tip": keys.TIP, "target": keys.TARGET}
-    if td[keys.SLOT_ACTIVE].shape[-1]:
-        own |= {"edge": keys.EDGE}
-        shared |= {"slot_descriptor": keys.SLOT_DESCRIPTOR, "slot_active": keys.SLOT_ACTIVE}
+    """Give each agent's row of its own entries, and those that all share; arrays that nothing else refers to."""
+    own = {
+        "position": entries.AGENT_POSITION,
+        "velocity": entries.AGENT_VELOCITY,
+        "previous_action": entries.PREVIOUS_ACTION,
+    }
+    shared: dict[str, Any] = {"tip": entries.TIP, "target": entries.TARGET}
+    if td[entries.SLOT_ACTIVE].shape[-1]:
+        own |= {"edge": entries.EDGE}
+        shared |= {"slot_descriptor": entries.SLOT_DESCRIPTOR, "slot_active": entries.SLOT_ACTIVE}
 
     def array(value: Tensor) -> Array:
         return np.array(value.cpu().numpy(), dtype=np.int8 if value.dtype == torch.bool else np.float32)
@@ -291,7 +296,7 @@ def _dict_rows(td: TensorDictBase) -> list[Observation]:
     return [
         {name: array(td[key][0, agent]) for name, key in own.items()}
         | {name: array(td[key][0]) for name, key in shared.items()}
-        for agent in range(td[keys.EDGE].shape[-2])
+        for agent in range(td[entries.EDGE].shape[-2])
     ]
 
 

@@ -2,7 +2,13 @@
 
 from softgm_bench.algorithms.ddpg import DDPG, DDPGConfig
 from softgm_bench.algorithms.ppo import PPO, PPOConfig
-from softgm_bench.algorithms.registry import Algorithm, algorithm_configs, build_algorithm, register_algorithm
+from softgm_bench.algorithms.registry import (
+    Algorithm,
+    algorithm_configs,
+    build_algorithm,
+    build_policy,
+    register_algorithm,
+)
 from softgm_bench.algorithms.sac import SAC, SACConfig
 
 __all__ = [
@@ -15,5 +21,6 @@ __all__ = [
     "SACConfig",
     "algorithm_configs",
     "build_algorithm",
+    "build_policy",
     "register_algorithm",
 ]

@@ -16,9 +16,10 @@ from torchrl.objectives import DDPGLoss
 
 from softgm_bench.algorithms.off_policy import Explorer, OffPolicy, OffPolicyConfig
 from softgm_bench.algorithms.registry import register_algorithm
-from softgm_bench.envs import SoftArmEnv, keys
+from softgm_bench.envs import entries
+from softgm_bench.envs.interface import Environment, Sizes
 from softgm_bench.models.action_value import ACTION_VALUE, build_action_value
-from softgm_bench.models.heads import ACTIONS, AgentHead, input_keys
+from softgm_bench.models.heads import AgentHead, input_keys
 from softgm_bench.models.registry import Encoder, build_encoder
 
 
@@ -46,17 +47,17 @@ class DDPGConfig(OffPolicyConfig):
 
 
 class DeterministicPolicy(TensorDictModuleBase):
-    """Writes ``keys.ACTION`` = tanh(f([o_i || g_i])), ``(..., N, 2)``; parameters shared by all agents."""
+    """Writes ``entries.ACTION`` = tanh(f([o_i || g_i])), ``(..., N, 2)``; parameters shared by all agents."""
 
-    def __init__(self, encoder: Encoder, config: DeterministicActorConfig, n_privileged: int = 0) -> None:
-        """Put the policy's head on an encoder."""
+    def __init__(self, encoder: Encoder, actions: int, config: DeterministicActorConfig, n_privileged: int = 0) -> None:
+        """Put the policy's head on an encoder; ``actions`` is A, the numbers in one agent's action."""
         super().__init__()
-        self.in_keys, self.out_keys = input_keys(encoder, n_privileged), [keys.ACTION]
-        self.head = AgentHead(encoder, config.widths, ACTIONS, last_gain=0.01, n_privileged=n_privileged)
+        self.in_keys, self.out_keys = input_keys(encoder, n_privileged), [entries.ACTION]
+        self.head = AgentHead(encoder, config.widths, actions, last_gain=0.01, n_privileged=n_privileged)
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
-        """Write ``keys.ACTION``."""
-        return td.set(keys.ACTION, self.head(td).tanh())
+        """Write ``entries.ACTION``."""
+        return td.set(entries.ACTION, self.head(td).tanh())
 
 
 class NoisyExplorer(Explorer):
@@ -70,16 +71,22 @@ class NoisyExplorer(Explorer):
         sigma: standard deviation of the noise.
     """
 
-    def __init__(self, actor: TensorDictModuleBase, correlation: float) -> None:
-        """Explore around ``actor``."""
-        super().__init__(actor)
-        self.correlation = correlation
-        self.sigma = 0.0
+    def __init__(self, actor: TensorDictModuleBase, actions: int, config: DDPGConfig, frames: int) -> None:
+        """Explore around ``actor``; arguments as of ``Explorer``."""
+        self.correlation = config.noise_correlation
+        super().__init__(actor, actions, config, frames)
+
+    def schedule(self, frames: int) -> None:
+        """Let the noise fall linearly too."""
+        super().schedule(frames)
+        config = self.config
+        progress = min(1.0, frames / config.sigma_frames)
+        self.sigma = config.initial_sigma + progress * (config.final_sigma - config.initial_sigma)
 
     def explore(self, action: Tensor, td: TensorDictBase) -> Tensor:
         """The actor's action with noise."""
         if self.correlation:
-            action = torch.lerp(action, td.get(keys.PREVIOUS_ACTION), self.correlation)
+            action = torch.lerp(action, td.get(entries.PREVIOUS_ACTION), self.correlation)
         fresh = math.sqrt(1.0 - self.correlation**2) * self.sigma
         return (action + fresh * torch.randn_like(action)).clamp(-1.0, 1.0)
 
@@ -91,27 +98,29 @@ class DDPG(OffPolicy):
     policy: NoisyExplorer
     reported = ("loss_actor", "loss_value", "q_mean", "target_mean")
 
-    def __init__(self, config: DDPGConfig, model_config: Any, env: SoftArmEnv, oracle: bool = False) -> None:
+    @staticmethod
+    def build_policy(
+        config: DDPGConfig, model_config: Any, sizes: Sizes, oracle: bool = False, frames: int = 0
+    ) -> NoisyExplorer:
+        """Build the actor alone; see ``algorithms.build_policy``."""
+        known = sizes.n_privileged if oracle else 0
+        actor = DeterministicPolicy(build_encoder(model_config, sizes), sizes.action, config.actor, known)
+        return NoisyExplorer(actor, sizes.action, config, frames)
+
+    def __init__(self, config: DDPGConfig, model_config: Any, env: Environment, oracle: bool = False) -> None:
         """Build networks, loss and optimisers for an environment's sizes and device.
 
-        An asymmetric critic, and actor and critic of an oracle, read ``keys.PRIVILEGED``.
+        An asymmetric critic, and actor and critic of an oracle, read ``entries.PRIVILEGED``.
         """
-        sizes = (model_config, env.n_agents, env.n_slots)
-        known_to_actor = env.n_privileged if oracle else 0
-        known_to_critic = env.n_privileged if oracle or config.critic.asymmetric else 0
-        actor = DeterministicPolicy(build_encoder(*sizes), config.actor, known_to_actor).to(env.device)
-        critic = build_action_value(*sizes, config.critic, config.centralised, known_to_critic).to(env.device)
-        loss = DDPGLoss(actor, critic, loss_function="l2", delay_actor=config.target_actor, delay_value=True)
+        sizes = env.sizes
+        known = sizes.n_privileged if oracle or config.critic.asymmetric else 0
+        policy = self.build_policy(config, model_config, sizes, oracle).to(env.device)
+        critic = build_action_value(model_config, sizes, config.critic, config.centralised, known).to(env.device)
+        loss = DDPGLoss(policy.actor, critic, loss_function="l2", delay_actor=config.target_actor, delay_value=True)
         loss.set_keys(state_action_value=ACTION_VALUE)
-        super().__init__(config, env, NoisyExplorer(actor, config.noise_correlation), loss, known_to_critic)
-        self._optimize("actor", list(actor.parameters()), config.actor_lr)
+        super().__init__(config, env, policy, loss, known)
+        self._optimize("actor", list(policy.actor.parameters()), config.actor_lr)
         self._optimize("critic", list(critic.parameters()), config.critic_lr)
-
-    def _schedule(self) -> None:
-        super()._schedule()
-        config = self.config
-        progress = min(1.0, self.frames / config.sigma_frames)
-        self.policy.sigma = config.initial_sigma + progress * (config.final_sigma - config.initial_sigma)
 
     def _metrics(self, losses: TensorDictBase) -> list[Tensor]:
         loss_actor = losses["loss_actor"]

@@ -8,15 +8,15 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
-from torchrl.objectives import LossModule, SoftUpdate, ValueEstimators
+from torchrl.objectives import LossModule, ValueEstimators
 
 from softgm_bench.algorithms.replay import Replay
 from softgm_bench.algorithms.team import give_to_agents
 from softgm_bench.algorithms.vector_replay import VectorReplay
-from softgm_bench.envs import SoftArmEnv, keys
-from softgm_bench.envs.vmas import VmasEnv
+from softgm_bench.envs import entries
+from softgm_bench.envs.interface import VECTOR, Environment
 from softgm_bench.models.action_value import ActionValueConfig
-from softgm_bench.models.heads import ACTIONS
+from softgm_bench.upstream.soft_update import FusedSoftUpdate
 
 # The team's reward and end of episode, as TorchRL's losses read them: per agent, (B, N, 1).
 AGENT_REWARD, AGENT_DONE, AGENT_TERMINATED = ("agents", "reward"), ("agents", "done"), ("agents", "terminated")
@@ -86,42 +86,45 @@ class Explorer(TensorDictModuleBase):
     """The policy that the collector and the evaluation call.
 
     Under ``ExplorationType.RANDOM`` it draws actions uniformly while ``uniform`` is set, and explores afterwards;
-    otherwise it does what ``actor`` does. It writes ``keys.ACTION`` alone, whatever else the actor writes.
+    otherwise it does what ``actor`` does. It writes ``entries.ACTION`` alone, whatever else the actor writes.
 
     Attributes:
         uniform: draw from [-1, 1], regardless of the observation.
     """
 
-    out_keys: ClassVar = [keys.ACTION]
+    out_keys: ClassVar = [entries.ACTION]
 
-    def __init__(self, actor: TensorDictModuleBase) -> None:
-        """Explore around ``actor``, whose parameters are shared."""
+    def __init__(self, actor: TensorDictModuleBase, actions: int, config: Any, frames: int) -> None:
+        """Explore around ``actor``, whose parameters are shared.
+
+        Args:
+            actor: writes ``entries.ACTION``.
+            actions: numbers in one agent's action, A.
+            config: an ``OffPolicyConfig``.
+            frames: it explores as after so many.
+        """
         super().__init__()
         self.in_keys = list(actor.in_keys)
-        self.actor = actor
-        self.uniform = False
+        self.actor, self.actions, self.config = actor, actions, config
+        self.schedule(frames)
+
+    def schedule(self, frames: int) -> None:
+        """Explore as after so many frames of training."""
+        self.uniform = frames < self.config.random_frames
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
-        """Write ``keys.ACTION``."""
+        """Write ``entries.ACTION``."""
         explores = exploration_type() is ExplorationType.RANDOM
         if explores and self.uniform:
             agents = td.get(self.in_keys[0])  # (..., N, any)
-            action = torch.empty((*agents.shape[:-1], ACTIONS), device=agents.device)
-            return td.set(keys.ACTION, action.uniform_(-1.0, 1.0))
-        action = self.actor(td.copy()).get(keys.ACTION)
-        return td.set(keys.ACTION, self.explore(action, td) if explores else action)
+            action = torch.empty((*agents.shape[:-1], self.actions), device=agents.device)
+            return td.set(entries.ACTION, action.uniform_(-1.0, 1.0))
+        action = self.actor(td.copy()).get(entries.ACTION)
+        return td.set(entries.ACTION, self.explore(action, td) if explores else action)
 
     def explore(self, action: Tensor, td: TensorDictBase) -> Tensor:
         """The action to take instead of the actor's; an actor that samples explores by itself."""
         return action
-
-
-class _SoftUpdate(SoftUpdate):
-    """TorchRL's, for all parameters in one call: one by one they take as long as their optimiser's step."""
-
-    def _step(self, p_source: TensorDictBase, p_target: TensorDictBase) -> None:
-        sources, targets = ([p.data for p in params.values(True, True)] for params in (p_source, p_target))
-        torch._foreach_lerp_(targets, sources, 1.0 - self.eps)
 
 
 class OffPolicy:
@@ -136,7 +139,7 @@ class OffPolicy:
 
     reported: ClassVar[tuple[str, ...]]
 
-    def __init__(self, config: Any, env: SoftArmEnv, policy: Explorer, loss: LossModule, n_privileged: int) -> None:
+    def __init__(self, config: Any, env: Environment, policy: Explorer, loss: LossModule, n_privileged: int) -> None:
         """Finish what a subclass began.
 
         Args:
@@ -144,19 +147,18 @@ class OffPolicy:
             env: whose sizes the memory has.
             policy: around the loss's actor.
             loss: without the team's keys and value estimator, which are added here.
-            n_privileged: channels of ``keys.PRIVILEGED`` that some network reads.
+            n_privileged: channels of ``entries.PRIVILEGED`` that some network reads.
         """
         self.config = config
         self.policy, self.loss = policy, loss
-        self.n_agents = env.n_agents
+        self.n_agents = env.sizes.n_agents
         loss.set_keys(reward=AGENT_REWARD, done=AGENT_DONE, terminated=AGENT_TERMINATED, priority=PRIORITY)
         loss.make_value_estimator(ValueEstimators.TD0, gamma=config.gamma)
-        self.target_update = _SoftUpdate(loss, tau=config.tau)
+        self.target_update = FusedSoftUpdate(loss, tau=config.tau)
         self.optimizers: dict[str, torch.optim.Optimizer] = {}
         self.replay = _make_replay(config.replay_capacity, env, n_privileged)
         self.frames = 0
         self._due = 0.0  # gradient steps, of which whole ones are taken
-        self._schedule()
 
     def update(self, batch: TensorDictBase) -> dict[str, float]:
         """Store frames, then take ``updates_per_frame`` gradient steps for each of them.
@@ -171,7 +173,7 @@ class OffPolicy:
         self.replay.add(batch)
         self.frames += batch.numel()
         steps = self._steps_for(batch.numel())
-        self._schedule()
+        self.policy.schedule(self.frames)
         totals = None
         for _ in range(steps):
             metrics = self._step(self.sample())
@@ -188,9 +190,9 @@ class OffPolicy:
         transitions = self.replay.sample(self.config.batch_size)
         after = transitions["next"]
         for of_team, of_agent in (
-            (keys.REWARD, AGENT_REWARD),
-            (keys.DONE, AGENT_DONE),
-            (keys.TERMINATED, AGENT_TERMINATED),
+            (entries.REWARD, AGENT_REWARD),
+            (entries.DONE, AGENT_DONE),
+            (entries.TERMINATED, AGENT_TERMINATED),
         ):
             after[of_agent] = give_to_agents(after[of_team], self.n_agents)
         return transitions
@@ -216,7 +218,7 @@ class OffPolicy:
         self.frames, self._due = state["frames"], state["due"]
         if "replay" in state:
             self.replay.load_state_dict(state["replay"])
-        self._schedule()
+        self.policy.schedule(self.frames)
 
     def _optimize(self, name: str, parameters: list[nn.Parameter], lr: float) -> None:
         """Add an optimiser."""
@@ -236,10 +238,6 @@ class OffPolicy:
         steps = int(self._due)
         self._due -= steps
         return steps
-
-    def _schedule(self) -> None:
-        """Set what depends on the number of frames."""
-        self.policy.uniform = self.frames < self.config.random_frames
 
     def _step(self, transitions: TensorDictBase) -> Tensor:
         """One gradient step of every network; metrics in the order of ``_names``."""
@@ -261,8 +259,8 @@ class OffPolicy:
         raise NotImplementedError
 
 
-def _make_replay(capacity: int, env: SoftArmEnv | VmasEnv, n_privileged: int) -> Replay | VectorReplay:
-    """The memory that fits what the environment observes."""
-    if isinstance(env, VmasEnv):
+def _make_replay(capacity: int, env: Environment, n_privileged: int) -> Replay | VectorReplay:
+    """Take the memory that fits the layout of the environment's observations."""
+    if env.sizes.layout == VECTOR:
         return VectorReplay(capacity, env.device)
-    return Replay(capacity, env.batch_size[0], env.n_agents, env.n_slots, env.device, n_privileged)
+    return Replay(capacity, env.batch_size[0], env.sizes, env.device, n_privileged)

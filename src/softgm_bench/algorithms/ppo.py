@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 from torchrl.modules.value_norm import PopArtValueNorm
 from torchrl.objectives import ClipPPOLoss
@@ -16,7 +17,8 @@ from torchrl.objectives.value import GAE
 
 from softgm_bench.algorithms.registry import register_algorithm
 from softgm_bench.algorithms.team import give_to_agents
-from softgm_bench.envs import SoftArmEnv, keys
+from softgm_bench.envs import entries
+from softgm_bench.envs.interface import Environment, Sizes
 from softgm_bench.models.heads import STATE_VALUE, ActorConfig, ValueConfig, build_actor, build_value
 
 ADVANTAGE, VALUE_TARGET = "advantage", "value_target"
@@ -92,17 +94,23 @@ class PPO:
         trained_frames: how many frames the updates so far have learnt from.
     """
 
-    def __init__(self, config: PPOConfig, model_config: Any, env: SoftArmEnv, oracle: bool = False) -> None:
+    @staticmethod
+    def build_policy(
+        config: PPOConfig, model_config: Any, sizes: Sizes, oracle: bool = False, frames: int = 0
+    ) -> ProbabilisticTensorDictSequential:
+        """Build the actor alone, which explores the same whatever ``frames``; see ``algorithms.build_policy``."""
+        return build_actor(model_config, sizes, config.actor, sizes.n_privileged if oracle else 0)
+
+    def __init__(self, config: PPOConfig, model_config: Any, env: Environment, oracle: bool = False) -> None:
         """Build networks, loss and optimisers for an environment's sizes and device.
 
-        An asymmetric critic, and actor and critic of an oracle, read ``keys.PRIVILEGED``.
+        An asymmetric critic, and actor and critic of an oracle, read ``entries.PRIVILEGED``.
         """
         self.config = config
-        sizes = (model_config, env.n_agents, env.n_slots)
-        known_to_actor = env.n_privileged if oracle else 0
-        known_to_critic = env.n_privileged if oracle or config.critic.asymmetric else 0
-        self.policy = build_actor(*sizes, config.actor, known_to_actor).to(env.device)
-        self.critic = build_value(*sizes, config.critic, config.centralised, known_to_critic).to(env.device)
+        sizes = env.sizes
+        known = sizes.n_privileged if oracle or config.critic.asymmetric else 0
+        self.policy = self.build_policy(config, model_config, sizes, oracle).to(env.device)
+        self.critic = build_value(model_config, sizes, config.critic, config.centralised, known).to(env.device)
         self.loss = ClipPPOLoss(
             self.policy,
             self.critic,
@@ -115,14 +123,14 @@ class PPO:
             functional=False,  # there are no target networks, for which parameters would be swapped at every call
             normalize_advantage=False,  # done once an iteration, over all of its frames
         )
-        self.loss.set_keys(action=keys.ACTION, sample_log_prob=keys.LOG_PROB, value=STATE_VALUE)
+        self.loss.set_keys(action=entries.ACTION, sample_log_prob=entries.LOG_PROB, value=STATE_VALUE)
         self.advantage = GAE(gamma=config.gamma, lmbda=config.gae_lambda, value_network=None, average_gae=False)
         self.value_norm: PopArtValueNorm | None = None
         if config.value_norm_decay is not None:
             self.value_norm = PopArtValueNorm(beta=config.value_norm_decay, device=env.device)
         # What an update reads of a frame; everything else stays out of the minibatches.
         read = dict.fromkeys((*self.policy.in_keys, *self.critic.in_keys))
-        self._trained_on = (*read, keys.ACTION, keys.LOG_PROB, ADVANTAGE, VALUE_TARGET)
+        self._trained_on = (*read, entries.ACTION, entries.LOG_PROB, ADVANTAGE, VALUE_TARGET)
         self._actor_parameters = list(self.policy.parameters())
         self._critic_parameters = list(self.critic.parameters())
         self.actor_optimizer = torch.optim.Adam(self._actor_parameters, lr=config.actor_lr, eps=1e-5, fused=True)
@@ -148,7 +156,7 @@ class PPO:
         self._set_learning_rates(epochs[-1]["kl_approx"])
         means = {name: sum(epoch[name] for epoch in epochs) / len(epochs) for name in self._names}
         if not self.loss.entropy_bonus:
-            means |= {"loss_entropy": 0.0, "entropy": -batch.get(keys.LOG_PROB).mean().item()}
+            means |= {"loss_entropy": 0.0, "entropy": -batch.get(entries.LOG_PROB).mean().item()}
         optimizers = {"actor_lr": self.actor_optimizer, "critic_lr": self.critic_optimizer}
         return means | {name: optimizer.param_groups[0]["lr"] for name, optimizer in optimizers.items()}
 
@@ -158,7 +166,7 @@ class PPO:
         Advantages are every agent's, ``(frames, N, 1)``. Value targets have the shape of the critic's values, and with
         value normalisation their scale.
         """
-        n_agents = batch.get(keys.LOG_PROB).shape[-1]
+        n_agents = batch.get(entries.LOG_PROB).shape[-1]
         frames = self._estimate(batch, n_agents).select(*self._trained_on).reshape(-1)
         advantage = frames.get(ADVANTAGE)
         if self.config.normalize_advantage:
@@ -175,7 +183,7 @@ class PPO:
     def _estimate(self, batch: TensorDictBase, n_agents: int) -> TensorDictBase:
         """Add ``ADVANTAGE`` and ``VALUE_TARGET`` to a copy of the batch, of the team or (independent) of each agent."""
         after = batch.get("next")
-        outcome = after.select(keys.REWARD, keys.DONE, keys.TERMINATED)
+        outcome = after.select(entries.REWARD, entries.DONE, entries.TERMINATED)
         if not self.config.centralised:
             outcome = outcome.apply(lambda of_team: give_to_agents(of_team, n_agents))
         estimates = self.advantage(

@@ -6,19 +6,25 @@ from typing import Any, Protocol, TypeVar
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
-from softgm_bench.envs import SoftArmEnv
+from softgm_bench.envs.interface import Environment, Sizes
 
 
 class Algorithm(Protocol):
     """What the experiment's loop knows of an algorithm.
 
     Attributes:
-        policy: reads ``keys.OBSERVATION`` (and ``keys.PRIVILEGED`` as an oracle), writes ``keys.ACTION``; explores
+        policy: reads ``entries.OBSERVATION`` (and ``entries.PRIVILEGED`` as an oracle), writes ``entries.ACTION``; explores
             under ``ExplorationType.RANDOM`` and is deterministic under ``ExplorationType.DETERMINISTIC``. The collector
             and the evaluation call it.
     """
 
     policy: TensorDictModuleBase
+
+    @staticmethod
+    def build_policy(
+        config: Any, model_config: Any, sizes: Sizes, oracle: bool = False, frames: int = 0
+    ) -> TensorDictModuleBase:
+        """Build ``policy`` alone, with fresh networks; it explores as after ``frames`` frames of training."""
 
     def update(self, batch: TensorDictBase) -> dict[str, float]:
         """Learn from ``(num_envs, steps)`` consecutive frames of the current policy; returns metrics to write down.
@@ -44,7 +50,7 @@ def register_algorithm(*names: str, config: type) -> Callable[[AlgorithmClass], 
 
     ``config`` is a dataclass with ``name: str`` and ``centralised: bool``, the schema of ``conf/algo/<name>.yaml`` for
     every one of the names. The class is called with the configuration, the model's configuration, the environment and
-    ``oracle: bool``, which says that the actor's head reads ``keys.PRIVILEGED`` too.
+    ``oracle: bool``, which says that the actor's head reads ``entries.PRIVILEGED`` too.
     """
 
     def register(algorithm: AlgorithmClass) -> AlgorithmClass:
@@ -62,13 +68,35 @@ def algorithm_configs() -> dict[str, type]:
     return dict(_configs)
 
 
-def build_algorithm(config: Any, model_config: Any, env: SoftArmEnv, oracle: bool = False) -> Algorithm:
-    """The algorithm that ``config.name`` means, with networks for the sizes and the device of ``env``.
+def build_algorithm(config: Any, model_config: Any, env: Environment, oracle: bool = False) -> Algorithm:
+    """Build the algorithm that ``config.name`` means, with networks for the sizes and the device of ``env``.
 
     Raises:
         ValueError: if there is no such algorithm, or ``config`` is another one's.
     """
+    return _class_of(config)(config, model_config, env, oracle)
+
+
+def build_policy(
+    config: Any, model_config: Any, sizes: Sizes, oracle: bool = False, frames: int = 0
+) -> TensorDictModuleBase:
+    """Build what acts, and nothing that learns: the policy of the algorithm that ``config.name`` means.
+
+    Args:
+        config: the algorithm's.
+        model_config: the model's.
+        sizes: the environment's.
+        oracle: the policy reads ``entries.PRIVILEGED`` too.
+        frames: it explores as after so many frames of training, if it is asked to explore.
+
+    Raises:
+        ValueError: if there is no such algorithm, or ``config`` is another one's.
+    """
+    return _class_of(config).build_policy(config, model_config, sizes, oracle, frames)
+
+
+def _class_of(config: Any) -> Any:
     name: str = config.name
     if _configs.get(name) is not type(config):
         raise ValueError(f"{type(config).__name__} is not the configuration of an algorithm named {name!r}")
-    return _algorithms[name](config, model_config, env, oracle)
+    return _algorithms[name]

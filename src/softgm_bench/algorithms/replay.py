@@ -13,13 +13,20 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from softgm_bench.envs import keys
+from softgm_bench.envs import entries
+from softgm_bench.envs.interface import Sizes
 
 Key = str | tuple[str, str]
 Columns = dict[str, Tensor]
 
 # Of an observation, what is stored of every frame as it is; edges and active slots are packed.
-PLAIN: tuple[Key, ...] = (keys.AGENT_POSITION, keys.AGENT_VELOCITY, keys.PREVIOUS_ACTION, keys.TIP, keys.TARGET)
+PLAIN: tuple[Key, ...] = (
+    entries.AGENT_POSITION,
+    entries.AGENT_VELOCITY,
+    entries.PREVIOUS_ACTION,
+    entries.TIP,
+    entries.TARGET,
+)
 FRAMES_PER_EPISODE = 8  # room for one episode in so many frames; shorter ones make old frames go earlier
 
 
@@ -39,12 +46,11 @@ class Replay:
         self,
         capacity: int,
         num_envs: int,
-        n_agents: int,
-        n_slots: int,
+        sizes: Sizes,
         device: torch.device | str,
         n_privileged: int = 0,
     ) -> None:
-        """Take the memory for ``capacity`` transitions, with ``keys.PRIVILEGED`` if ``n_privileged`` is above 0.
+        """Take the memory for ``capacity`` transitions, with ``entries.PRIVILEGED`` if ``n_privileged`` is above 0.
 
         On a CPU the system provides it page by page when it is written.
 
@@ -55,26 +61,20 @@ class Replay:
             raise ValueError(
                 f"algo.replay_capacity is {capacity}: it must be at least two frames of each of {num_envs} environments"
             )
+        n_slots = sizes.n_slots
         self.num_envs, self.n_slots = num_envs, n_slots
         self.rows = -(-capacity // num_envs)
         self.episodes = max(2, -(-self.rows // FRAMES_PER_EPISODE))
         self.device = torch.device(device)
         self._bytes = -(-n_slots // 8)  # of one agent's edges
-        observation = {
-            "position": ((n_agents, 3), torch.float32),
-            "velocity": ((n_agents, 3), torch.float32),
-            "previous_action": ((n_agents, 2), torch.float32),
-            "tip": ((3,), torch.float32),
-            "target": ((3,), torch.float32),
-            "edge": ((n_agents, self._bytes), torch.uint8),
+        self._plain: tuple[Key, ...] = (*PLAIN, entries.PRIVILEGED) if n_privileged else PLAIN
+        observation = {_name(key): (entries.shape_of(key, sizes), torch.float32) for key in self._plain}
+        observation |= {
+            "edge": ((sizes.n_agents, self._bytes), torch.uint8),
             "count": ((), torch.int32),
         }
-        self._plain: tuple[Key, ...] = PLAIN
-        if n_privileged:
-            self._plain = (*PLAIN, keys.PRIVILEGED)
-            observation |= {keys.PRIVILEGED: ((n_privileged,), torch.float32)}
         step = {
-            "action": ((n_agents, 2), torch.float32),
+            "action": (entries.shape_of(entries.ACTION, sizes), torch.float32),
             "reward": ((1,), torch.float32),
             "done": ((1,), torch.bool),
             "terminated": ((1,), torch.bool),
@@ -129,9 +129,9 @@ class Replay:
         self._size = int((self._now - lower).sum())
 
     def sample(self, size: int) -> TensorDict:
-        """Independent, uniformly drawn transitions ``(size,)``: ``keys.OBSERVATION``, action and "next".
+        """Independent, uniformly drawn transitions ``(size,)``: ``entries.OBSERVATION``, action and "next".
 
-        Under "next": ``keys.OBSERVATION``, reward, done and terminated, of the team.
+        Under "next": ``entries.OBSERVATION``, reward, done and terminated, of the team.
         """
         held = self._now - self._lower()
         ends = held.cumsum(0)
@@ -155,7 +155,7 @@ class Replay:
     def _add(self, batch: TensorDictBase) -> None:
         steps = batch.shape[1]
         before, after = self._pack(batch), self._pack(batch.get("next"))
-        done = batch["next", keys.DONE].squeeze(-1).T  # (steps, num_envs)
+        done = batch["next", entries.DONE].squeeze(-1).T  # (steps, num_envs)
         begins = torch.ones_like(done)
         begins[0] = self._begins({name: column[0] for name, column in before.items()})
         begins[1:] = done[:-1]
@@ -163,10 +163,10 @@ class Replay:
         entry = episode % self.episodes
         time = torch.arange(self._now, self._now + steps, device=self.device)
         frames = before | {
-            "action": _by_time(batch[keys.ACTION]),
-            "reward": _by_time(batch["next", keys.REWARD]),
+            "action": _by_time(batch[entries.ACTION]),
+            "reward": _by_time(batch["next", entries.REWARD]),
             "done": done.unsqueeze(-1),
-            "terminated": _by_time(batch["next", keys.TERMINATED]),
+            "terminated": _by_time(batch["next", entries.TERMINATED]),
             "closed": done,
             "episode": entry.to(torch.int32),
         }
@@ -183,7 +183,7 @@ class Replay:
         where = (entry[step, environment], environment)
         for name, column in after.items():
             self._last[name][where] = column[step, environment]
-        self._table[where] = batch["next", keys.SLOT_DESCRIPTOR][environment, step]
+        self._table[where] = batch["next", entries.SLOT_DESCRIPTOR][environment, step]
 
         self._now += steps
         self._episode = episode[-1] + done[-1].long()
@@ -207,12 +207,14 @@ class Replay:
 
     def _pack(self, td: TensorDictBase) -> Columns:
         """An observation ``(num_envs, steps)`` as it is stored, ``(steps, num_envs, ...)``."""
-        active = td[keys.SLOT_ACTIVE]
+        active = td[entries.SLOT_ACTIVE]
         count = active.sum(-1, dtype=torch.int32)
         if not torch.equal(active, self._active(count)):
             raise ValueError("the active slots of a frame are not its first ones")
-        columns = {key if isinstance(key, str) else key[1]: _by_time(td[key]) for key in self._plain}
-        edge = torch.nn.functional.pad(_by_time(td[keys.EDGE]), (0, -self.n_slots % 8)).unflatten(-1, (self._bytes, 8))
+        columns = {_name(key): _by_time(td[key]) for key in self._plain}
+        edge = torch.nn.functional.pad(_by_time(td[entries.EDGE]), (0, -self.n_slots % 8)).unflatten(
+            -1, (self._bytes, 8)
+        )
         return columns | {"edge": (edge * self._powers).sum(-1, dtype=torch.uint8), "count": _by_time(count)}
 
     # reading
@@ -234,24 +236,24 @@ class Replay:
             for name, last in self._last.items()
         }
         transition = self._unpack(frames, descriptor)
-        transition[keys.ACTION] = frames["action"]
+        transition[entries.ACTION] = frames["action"]
         next_transition = self._unpack(after, descriptor)
-        next_transition[keys.REWARD] = frames["reward"]
-        next_transition[keys.DONE] = frames["done"]
-        next_transition[keys.TERMINATED] = frames["terminated"]
+        next_transition[entries.REWARD] = frames["reward"]
+        next_transition[entries.DONE] = frames["done"]
+        next_transition[entries.TERMINATED] = frames["terminated"]
         transition["next"] = next_transition
         return transition
 
     def _unpack(self, columns: Columns, descriptor: Tensor) -> TensorDict:
-        """Entries ``keys.OBSERVATION`` of stored observations ``(size, ...)`` with tables ``(size, M, 9)``."""
+        """Entries ``entries.OBSERVATION`` of stored observations ``(size, ...)`` with tables ``(size, M, 9)``."""
         td = TensorDict({}, batch_size=[len(descriptor)], device=self.device)
         for key in self._plain:
-            td[key] = columns[key if isinstance(key, str) else key[1]]
+            td[key] = columns[_name(key)]
         edge = (columns["edge"].unsqueeze(-1) & self._powers).bool()
         active = self._active(columns["count"])
-        td[keys.EDGE] = edge.flatten(-2)[..., : self.n_slots]
-        td[keys.SLOT_ACTIVE] = active
-        td[keys.SLOT_DESCRIPTOR] = torch.where(active.unsqueeze(-1), descriptor, 0.0)
+        td[entries.EDGE] = edge.flatten(-2)[..., : self.n_slots]
+        td[entries.SLOT_ACTIVE] = active
+        td[entries.SLOT_DESCRIPTOR] = torch.where(active.unsqueeze(-1), descriptor, 0.0)
         return td
 
     def _active(self, count: Tensor) -> Tensor:
@@ -271,6 +273,11 @@ class Replay:
         rings |= {f"last.{name}": tensor for name, tensor in self._last.items()}
         one_by_one = {"table": self._table, "begin": self._begin, "episode": self._episode, "oldest": self._oldest}
         return rings | one_by_one
+
+
+def _name(key: Key) -> str:
+    """Name an entry as its column is."""
+    return key if isinstance(key, str) else key[1]
 
 
 def _by_time(values: Tensor) -> Tensor:

@@ -5,16 +5,16 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 
-from softgm_bench.envs import keys
+from softgm_bench.envs import entries
 from softgm_bench.envs.vmas import OBSERVATION
 
 STORED = (
     OBSERVATION,
-    keys.ACTION,
+    entries.ACTION,
     ("next", OBSERVATION),
-    ("next", keys.REWARD),
-    ("next", keys.DONE),
-    ("next", keys.TERMINATED),
+    ("next", entries.REWARD),
+    ("next", entries.DONE),
+    ("next", entries.TERMINATED),
 )
 
 

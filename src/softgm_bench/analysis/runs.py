@@ -20,7 +20,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from softgm_bench.config import UserError
-from softgm_bench.runs.folder import RunFolder
+from softgm_bench.storage.run_folder import RunFolder
 
 Columns = Mapping[str, NDArray[np.float64]]
 TRUTH = {"True": 1.0, "False": 0.0, "": float("nan")}

@@ -328,7 +328,7 @@ def _validate_by_building(config: Config) -> None:
                 perturbation=config.perturbation,
             )
         observed = set(env.observation_spec.keys(True, True))
-        encoder = build_encoder(config.model, env.n_agents, env.n_slots)
+        encoder = build_encoder(config.model, env.sizes)
     except ValueError as error:
         raise UserError(str(error)) from error
     if not observed.issuperset(encoder.in_keys):

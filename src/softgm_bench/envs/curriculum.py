@@ -4,7 +4,7 @@ Difficulty rises in ``stages`` equal steps from 0, the easiest scenes, to 1, the
 object share the stage. It moves after a round, of which every environment counts its first episodes and no others: a
 window over the episodes that end first would hold the quick ones, which are successes.
 
-A round can end in any step, and nothing here looks at values: see ``softgm_bench.rod.dense``.
+A round can end in any step, and nothing here looks at values: see ``softgm_bench.rod.sync``.
 """
 
 import torch

@@ -17,8 +17,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-CHANNELS = 8  # of a section's own observation: position (3), velocity (3), previous action (2)
-
 
 @dataclass
 class PerturbationConfig:
@@ -77,27 +75,16 @@ class Perturbation:
     Attributes:
         config: what can happen.
         generator: from which everything is drawn, and nothing else: scenes are those without a perturbation.
-        direction: of the force on the tip in the episodes under way, ``(num_envs, 3)``.
     """
 
-    def __init__(
-        self,
-        config: PerturbationConfig,
-        num_envs: int,
-        n_agents: int,
-        seed: int,
-        device: torch.device,
-        dtype: torch.dtype,
-    ) -> None:
+    def __init__(self, config: PerturbationConfig, n_agents: int, seed: int, device: torch.device) -> None:
         """Prepare; ``begin`` draws.
 
         Args:
             config: what happens.
-            num_envs: environments simulated at once.
-            n_agents: sections of each.
+            n_agents: sections of each environment.
             seed: the environment's.
             device: of all tensors.
-            dtype: of the force.
 
         Raises:
             ValueError: with one line naming the key, its value and what would be right.
@@ -113,42 +100,49 @@ class Perturbation:
         works = [[agent not in config.failed_agents] for agent in range(n_agents)]
         self._works = torch.tensor(works, device=device)
         self._silence = torch.zeros((), device=device)
-        self.direction = torch.zeros((num_envs, 3), dtype=dtype, device=device)
 
     def seed(self, seed: int) -> None:
         """Begin the own stream of random numbers that belongs to an environment's seed; it is not the scenes'."""
         self.generator.manual_seed(int(np.random.SeedSequence(seed, spawn_key=(1,)).generate_state(1)[0]))
 
-    def begin(self, mask: Tensor | None = None) -> None:
-        """Draw what belongs to an episode for those that begin, ``(num_envs,)`` bool, all by default."""
+    def begin(self, push: Tensor, mask: Tensor | None = None) -> Tensor:
+        """Draw the direction of the force on the tip for the episodes that begin.
+
+        Args:
+            push: directions in the episodes so far, ``(num_envs, 3)``; not changed.
+            mask: which episodes begin, ``(num_envs,)`` bool; all by default.
+
+        Returns:
+            The directions from now on; as they were if no force ever acts.
+        """
         if not self.config.pushes:
-            return
-        drawn = torch.empty_like(self.direction).normal_(generator=self.generator)
+            return push
+        drawn = torch.empty_like(push).normal_(generator=self.generator)
         drawn /= drawn.norm(dim=-1, keepdim=True)
-        self.direction = drawn if mask is None else torch.where(mask.unsqueeze(-1), drawn, self.direction)
+        return drawn if mask is None else torch.where(mask.unsqueeze(-1), drawn, push)
 
     def applied(self, action: Tensor) -> Tensor:
         """Of the actions that policies chose, ``(num_envs, n_agents, 2)``, what the sections do."""
         return torch.where(self._works, action, self._silence) if self.config.failed_agents else action
 
-    def tip_force(self, steps: Tensor, active: Tensor) -> Tensor | None:
-        """Force on the tip during a control step, N, ``(num_envs, 3)``; None if there never is one.
+    def tip_force(self, push: Tensor, steps: Tensor, active: Tensor) -> Tensor:
+        """Compute the force on the tip during a control step, N, ``(num_envs, 3)``.
 
         Args:
+            push: its direction, ``(num_envs, 3)``.
             steps: control steps since the reset, before this one, ``(num_envs,)``.
             active: whether the environment moves, ``(num_envs,)`` bool.
         """
         config = self.config
-        if not config.pushes:
-            return None
         now = active & (steps >= config.first_step) & (steps < config.first_step + config.steps)
-        return config.tip_force * self.direction * now.unsqueeze(-1)
+        return config.tip_force * push * now.unsqueeze(-1)
 
     def observed(self, position: Tensor, velocity: Tensor, previous_action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """What agents observe of themselves: ``(count, n_agents, 3)``, the same, ``(count, n_agents, 2)``; float32."""
         if not self.config.noisy:
             return position, velocity, previous_action
-        noise = position.new_empty((*position.shape[:-1], CHANNELS)).normal_(generator=self.generator)
+        channels = 2 * position.shape[-1] + previous_action.shape[-1]
+        noise = position.new_empty((*position.shape[:-1], channels)).normal_(generator=self.generator)
         return (
             position + self.config.position_sigma * noise[..., :3],
             velocity + self.config.velocity_sigma * noise[..., 3:6],

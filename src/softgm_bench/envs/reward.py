@@ -29,7 +29,7 @@ def reward_terms(
         success: d_t below the success radius, ``(num_envs,)`` bool.
 
     Returns:
-        Terms by the names in ``keys.REWARD_TERM_NAMES``, ``(num_envs,)`` each.
+        Terms by the names in ``entries.REWARD_TERM_NAMES``, ``(num_envs,)`` each.
     """
     progress = previous_distance - distance
     touching = (contact_nodes > 0).to(distance.dtype)

@@ -11,7 +11,7 @@ from tensordict import TensorClass
 from torch import Tensor
 
 from softgm_bench.envs import sensing_kernel
-from softgm_bench.rod.dense import arrays, dense
+from softgm_bench.rod import sync
 from softgm_bench.rod.state import Cylinders
 
 
@@ -127,7 +127,7 @@ def look(
     Returns:
         What the agents see; equal, bit by bit, to ``look_dense``.
     """
-    if dense(agent_position.device):
+    if not sync.is_free(agent_position.device):
         return look_dense(agent_position, bins, table, sensing_radius)
     num_envs, n_agents = agent_position.shape[:2]
     n_slots = table.bin_of_slot.shape[1]
@@ -139,9 +139,9 @@ def look(
     updated = [value.clone() for value in (table.bin_of_slot, table.known, table.count, table.dropped)]
     new = torch.empty_like(table.count)
     scene = (cylinders.start, cylinders.axis, cylinders.length, cylinders.radius, cylinders.mask)
-    read = arrays(agent_position, *scene, bins.descriptor, bins.mask)
+    read = sync.arrays(agent_position, *scene, bins.descriptor, bins.mask)
     real = read[0].dtype.type
-    written = arrays(*updated, new, descriptor, active, edge)
+    written = sync.arrays(*updated, new, descriptor, active, edge)
     arguments = [*read, real(sensing_radius), real(bin_length), *written]
     sensing_kernel.look(*arguments)
     return Sight(SlotTable(*updated, batch_size=table.batch_size), new, descriptor, active, edge)

@@ -1,63 +1,54 @@
-"""The environment's TorchRL specs; meaning and units of the entries in ``keys``."""
+"""The environment's TorchRL specs, made from the table of entries."""
 
 import torch
-from torchrl.data import Binary, Bounded, Composite, Unbounded
+from tensordict import NestedKey
+from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 
-from softgm_bench.envs import keys
+from softgm_bench.envs import entries
+from softgm_bench.envs.interface import Sizes
 
-DIRECTIONS = 2  # normal and binormal
-
-INFO = (
-    keys.SUCCESS,
-    keys.DIVERGED,
-    keys.DISTANCE,
-    keys.TIP_STEP,
-    keys.CONTACT_NODES,
-    keys.DISCOVERED,
-    keys.DROPPED,
-    keys.TORQUE_PER_AGENT,
-    keys.TORQUE_JOINT,
-)
+ENDS = (entries.DONE, entries.TERMINATED, entries.TRUNCATED)
 
 
 def make_specs(
-    num_envs: int, n_agents: int, n_slots: int, n_privileged: int, curriculum: bool, device: torch.device
-) -> dict[str, Composite]:
-    """Specs by the name of the ``EnvBase`` attribute, each with the batch dimension.
+    num_envs: int, sizes: Sizes, device: torch.device, *, curriculum: bool = False, perturbed: bool = False
+) -> dict[str, TensorSpec]:
+    """Make the specs of the arm's environment, each with the batch dimension, by the name of ``EnvBase``'s attribute.
 
-    Without privileged numbers or without a curriculum, their entries are absent.
+    Args:
+        num_envs: B.
+        sizes: without privileged numbers their entry is absent.
+        device: of all entries.
+        curriculum: whether scenes have a difficulty; without one its entry is absent.
+        perturbed: whether the previous action that agents observe may leave its bounds.
     """
+    absent = {entries.ACTION, entries.REWARD, *ENDS}
+    absent |= set() if sizes.n_privileged else {entries.PRIVILEGED}
+    absent |= set() if curriculum else {entries.DIFFICULTY}
 
-    def real(*shape: int) -> Unbounded:
-        return Unbounded(shape=(num_envs, *shape), dtype=torch.float32, device=device)
+    def spec(key: NestedKey) -> TensorSpec:
+        entry, shape = entries.TABLE[key], (num_envs, *entries.shape_of(key, sizes))
+        if entry.dtype is torch.bool:
+            return Binary(shape=shape, dtype=torch.bool, device=device)
+        if entry.bounded and not (perturbed and key == entries.PREVIOUS_ACTION):
+            return Bounded(-1.0, 1.0, shape=shape, dtype=entry.dtype, device=device)
+        return Unbounded(shape=shape, dtype=entry.dtype, device=device)
 
-    def flag(*shape: int) -> Binary:
-        return Binary(shape=(num_envs, *shape), dtype=torch.bool, device=device)
+    def composite(*keys: NestedKey) -> Composite:
+        groups: dict[str, dict[str, TensorSpec]] = {}
+        root: dict[str, TensorSpec] = {}
+        for key in keys:
+            if isinstance(key, str):
+                root[key] = spec(key)
+            else:
+                groups.setdefault(key[0], {})[key[1]] = spec(key)
+        for name, group in groups.items():
+            root[name] = Composite(group, shape=(num_envs, *entries.group_shape(name, sizes)), device=device)
+        return Composite(root, shape=(num_envs,), device=device)
 
-    def group(entries: dict, *shape: int) -> Composite:
-        return Composite(entries, shape=(num_envs, *shape), device=device)
-
-    action = Bounded(-1.0, 1.0, shape=(num_envs, n_agents, DIRECTIONS), dtype=torch.float32, device=device)
-    agents = {
-        "position": real(n_agents, 3),
-        "velocity": real(n_agents, 3),
-        "previous_action": action.clone(),
-        "edge": flag(n_agents, n_slots),
-    }
-    info = (*INFO, keys.DIFFICULTY) if curriculum else INFO
-    observation = {
-        "agents": group(agents, n_agents),
-        "slots": group({"descriptor": real(n_slots, 9), "active": flag(n_slots)}, n_slots),
-        "tip": real(3),
-        "target": real(3),
-        "info": group({key[1]: flag(1) if key in (keys.SUCCESS, keys.DIVERGED) else real(1) for key in info}),
-        "reward_terms": group({name: real(1) for name in keys.REWARD_TERM_NAMES}),
-    }
-    if n_privileged:
-        observation[keys.PRIVILEGED] = real(n_privileged)
     return {
-        "observation_spec": group(observation),
-        "action_spec": group({"agents": group({"action": action}, n_agents)}),
-        "reward_spec": real(1),
-        "done_spec": group({"done": flag(1), "terminated": flag(1), "truncated": flag(1)}),
+        "observation_spec": composite(*(key for key in entries.TABLE if key not in absent)),
+        "action_spec": composite(entries.ACTION),
+        "reward_spec": spec(entries.REWARD),
+        "done_spec": composite(*ENDS),
     }

@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from softgm_bench.envs import keys
+from softgm_bench.envs import entries
 
 CHANNELS = 15  # of an agent or a slot, without the paper's reserved zeros
 
@@ -18,8 +18,8 @@ def agent_channels(td: TensorDictBase, velocity_scale: float = 1.0) -> Tensor:
     In order: position, velocity, previous action (tangential zero, normal, binormal), target - position,
     tip - position. The velocity is multiplied by ``velocity_scale``; 1 is the paper.
     """
-    position, velocity, action = td[keys.AGENT_POSITION], td[keys.AGENT_VELOCITY], td[keys.PREVIOUS_ACTION]
-    target, tip = td[keys.TARGET].unsqueeze(-2), td[keys.TIP].unsqueeze(-2)
+    position, velocity, action = td[entries.AGENT_POSITION], td[entries.AGENT_VELOCITY], td[entries.PREVIOUS_ACTION]
+    target, tip = td[entries.TARGET].unsqueeze(-2), td[entries.TIP].unsqueeze(-2)
     tangential = action.new_zeros(()).expand(*action.shape[:-1], 1)
     if velocity_scale != 1.0:
         velocity = velocity * velocity_scale
@@ -31,8 +31,8 @@ def slot_channels(td: TensorDictBase) -> Tensor:
 
     In order: centre, axis, (radius, length, normalised axial position), target - centre, tip - centre.
     """
-    descriptor, active = td[keys.SLOT_DESCRIPTOR], td[keys.SLOT_ACTIVE].unsqueeze(-1)
-    target, tip = td[keys.TARGET].unsqueeze(-2), td[keys.TIP].unsqueeze(-2)
+    descriptor, active = td[entries.SLOT_DESCRIPTOR], td[entries.SLOT_ACTIVE].unsqueeze(-1)
+    target, tip = td[entries.TARGET].unsqueeze(-2), td[entries.TIP].unsqueeze(-2)
     return torch.where(active, obstacle_channels(descriptor, target, tip), 0.0)
 
 
@@ -50,7 +50,7 @@ def flat_observation(td: TensorDictBase) -> Tensor:
     """
     own, slots = agent_channels(td), slot_channels(td)
     shared = slots.flatten(-2).unsqueeze(-2).expand(*own.shape[:-1], -1)
-    return torch.cat([own, shared, td[keys.EDGE].to(own.dtype)], dim=-1)
+    return torch.cat([own, shared, td[entries.EDGE].to(own.dtype)], dim=-1)
 
 
 def flat_features(n_slots: int) -> int:

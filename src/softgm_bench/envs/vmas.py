@@ -13,10 +13,11 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from softgm_bench.envs import keys
+from softgm_bench.envs import entries
+from softgm_bench.envs.interface import Kind, Settings, Sizes, register_kind
 
 OBSERVATION = ("agents", "observation")  # (B, N, F) float32: all that an agent observes
-DIRECTIONS = 2
+DIRECTIONS = 2  # of a force in the plane
 SCENARIOS = {"vmas_balance": "balance", "vmas_navigation": "navigation"}
 
 
@@ -48,18 +49,16 @@ class VmasConfig:
 
 
 class VmasEnv(EnvBase):
-    """A VMAS scenario with ``batch_size=(num_envs,)``: entry ``OBSERVATION`` and those of ``keys`` that fit.
+    """A VMAS scenario with ``batch_size=(num_envs,)``: entry ``OBSERVATION`` and those of ``entries`` that fit.
 
     The reward is the team's, the mean over agents of VMAS's rewards. TorchRL's own ``VmasEnv`` resets one environment
     after another in Python; here the states of a full, batched reset are kept in store, and an environment that begins
     again takes the next of them. States are drawn from a generator of the environment's own.
 
     Attributes:
-        n_slots: F, length of an agent's observation: what models are told of an observation's size, as the arm's M.
-        n_privileged: 0.
+        sizes: of its actions and observations.
+        horizon: steps until an episode ends.
     """
-
-    n_privileged = 0
 
     def __init__(self, config: VmasConfig, num_envs: int, seed: int, horizon: int | None = None) -> None:
         """Build the environments on the CPU.
@@ -79,11 +78,10 @@ class VmasEnv(EnvBase):
         self._set_seed(seed)
         self.scenario = _make_scenario(SCENARIOS[config.name], num_envs, config.scenario)
         self.agents = self.scenario.world.policy_agents
-        self.n_agents: int = len(self.agents)
         # of a state, everything that a reset writes; the rest VMAS computes anew in every step
         self._names = [name for name, _ in self._state()]
         self._observation = self._observe()
-        self.n_slots: int = self._observation.shape[-1]
+        self.sizes = Sizes(len(self.agents), DIRECTIONS, n_features=self._observation.shape[-1])
         self._steps = torch.zeros(num_envs, dtype=torch.int64)
         self._terminated = torch.zeros(num_envs, dtype=torch.bool)
         self._truncated = torch.zeros(num_envs, dtype=torch.bool)
@@ -92,13 +90,13 @@ class VmasEnv(EnvBase):
         self._make_specs()
 
     def _make_specs(self) -> None:
-        size, n_agents = self.batch_size[0], self.n_agents
+        size, n_agents = self.batch_size[0], self.sizes.n_agents
 
         def flag() -> Binary:
             return Binary(shape=(size, 1), dtype=torch.bool)
 
-        observation = Unbounded(shape=(size, n_agents, self.n_slots), dtype=torch.float32)
-        action = Bounded(-1.0, 1.0, shape=(size, n_agents, DIRECTIONS), dtype=torch.float32)
+        observation = Unbounded(shape=(size, n_agents, self.sizes.n_features), dtype=torch.float32)
+        action = Bounded(-1.0, 1.0, shape=(size, n_agents, self.sizes.action), dtype=torch.float32)
         self.observation_spec = Composite(
             agents=Composite(observation=observation, shape=(size, n_agents)), shape=(size,)
         )
@@ -128,8 +126,8 @@ class VmasEnv(EnvBase):
         return self._frame()
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """What ``EnvBase.maybe_reset`` does, at less cost."""
-        done = tensordict.get(keys.DONE)
+        """Do what ``EnvBase.maybe_reset`` does, at less cost."""
+        done = tensordict.get(entries.DONE)
         if bool(done.any()):
             self._begin_again(done.reshape(-1))
             tensordict.update(self._frame())
@@ -137,7 +135,7 @@ class VmasEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         world = self.scenario.world
-        action = tensordict.get(keys.ACTION).clamp(-1.0, 1.0)
+        action = tensordict.get(entries.ACTION).clamp(-1.0, 1.0)
         for agent, of_agent in zip(self.agents, action.unbind(1), strict=True):
             agent.action.u = of_agent * (agent.action.u_range_tensor * agent.action.u_multiplier_tensor)
         for agent in world.agents:
@@ -151,12 +149,12 @@ class VmasEnv(EnvBase):
         limit, ended = self._steps >= self.horizon, self.scenario.done()
         self._terminated = ended | limit if self.limit_terminates else ended.clone()
         self._truncated = limit & ~self._terminated
-        return self._frame().set(keys.REWARD, reward.unsqueeze(-1))
+        return self._frame().set(entries.REWARD, reward.unsqueeze(-1))
 
     def _frame(self) -> TensorDict:
         """Observation and flags as they stand, in tensors that later steps do not write to."""
         terminated, truncated = self._terminated.unsqueeze(-1), self._truncated.unsqueeze(-1)
-        agents = TensorDict({"observation": self._observation.clone()}, (*self.batch_size, self.n_agents))
+        agents = TensorDict({"observation": self._observation.clone()}, (*self.batch_size, self.sizes.n_agents))
         flags = {"terminated": terminated.clone(), "truncated": truncated.clone(), "done": terminated | truncated}
         return TensorDict({"agents": agents, **flags}, self.batch_size, device=self.device)
 
@@ -259,3 +257,34 @@ def _make_scenario(name: str, num_envs: int, arguments: dict[str, Any]) -> Any:
     except ImportError as error:
         raise ValueError(f"task=vmas_{name} needs VMAS: pip install 'softgm-bench[vmas]'") from error
     return vmas.make_env(name, num_envs=num_envs, device="cpu", **arguments).scenario
+
+
+def _build(settings: Settings, num_envs: int, seed: int, horizon: int | None, training: bool) -> VmasEnv:
+    return VmasEnv(settings.task, num_envs, seed, horizon)
+
+
+def _check(settings: Settings) -> None:
+    """Refuse what only the arm has.
+
+    Raises:
+        ValueError: with one line naming the key, its value and what would be right.
+    """
+    task = f"task={settings.task.name}"
+    if settings.device != "cpu":
+        raise ValueError(f"device={settings.device}: {task} runs on the CPU")
+    if not settings.perturbation.nothing:
+        raise ValueError(f"perturbation={settings.perturbation.name}: {task} has no arm; it must be none")
+    if settings.oracle:
+        raise ValueError(f"observation=oracle: {task} has nothing that an oracle would be told")
+
+
+VMAS = register_kind(
+    Kind(
+        base=VmasConfig,
+        configs=lambda: dict.fromkeys(SCENARIOS, VmasConfig),
+        build=_build,
+        sizes=lambda config: VmasEnv(config, 1, 0).sizes,
+        check=_check,
+        has_arm=False,
+    )
+)

@@ -1,92 +1,61 @@
 """Vectorised evaluation: every environment counts exactly its first episode."""
 
 import itertools
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from tensordict import NestedKey, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
-from softgm_bench.envs import keys
-from softgm_bench.rod.dense import dense
+from softgm_bench.envs import entries
+from softgm_bench.envs.entries import Column
+from softgm_bench.rod import sync
 
 DISCOUNT = 0.99  # of the returns that are reported, whatever an algorithm trains with
-# Of an episode, by name in its records: what is summed over its steps, the discounted return first; of that what is
-# divided by their number; at how many steps something was above 0; what happened at any of them; and what was the case
-# at the last one.
-SUMMED: dict[str, NestedKey] = {
-    "discounted_return": keys.REWARD,
-    "undiscounted_return": keys.REWARD,
-    "tip_travel_distance": keys.TIP_STEP,
-    "torque_per_agent": keys.TORQUE_PER_AGENT,
-    "torque_joint": keys.TORQUE_JOINT,
-    **{f"reward_{name}": (keys.REWARD_TERMS, name) for name in keys.REWARD_TERM_NAMES},
-}
-AVERAGED = frozenset({"torque_per_agent", "torque_joint"})
-COUNTED: dict[str, NestedKey] = {"contact_steps": keys.CONTACT_NODES}
-HAPPENED: dict[str, NestedKey] = {"success": keys.SUCCESS, "diverged": keys.DIVERGED}
-LAST: dict[str, NestedKey] = {
-    "final_distance": keys.DISTANCE,
-    "discovered_bins": keys.DISCOVERED,
-    "dropped_bins": keys.DROPPED,
-}
-WHOLE = frozenset({"discovered_bins", "dropped_bins"})
-LOOK_EVERY = 16  # steps between two looks at whether an episode goes on, on a device that a look waits for
+CHECK_EVERY = 16  # steps between two checks whether an episode goes on, on a device that a check waits for
+
+Values = NDArray[np.float64] | NDArray[np.int64] | NDArray[np.bool_]
 
 
-@dataclass(frozen=True)
-class EpisodeRecords:
-    """One entry per episode in every field, ``(episodes,)``; None what the task does not tell.
+class EpisodeRecords(Mapping[str, Values]):
+    """One number per episode in every column, ``(episodes,)``; columns are those of ``entries.EPISODE_COLUMNS``.
 
-    Attributes:
-        discounted_return: sum of gamma^t r_t.
-        undiscounted_return: sum of r_t.
-        length: control steps.
-        success: whether the tip reached the target.
-        diverged: whether the simulation broke; never a success.
-        tip_travel_distance: length of the tip's path, m.
-        final_distance: tip to target at the end, m.
-        torque_per_agent: mean over steps and agents of an agent's torque, N m.
-        torque_joint: mean over steps of the norm over all agents and axes, N m.
-        contact_steps: control steps at whose end any node touched an obstacle.
-        discovered_bins: in the table of obstacles at the end.
-        dropped_bins: that the table had no slot for.
-        reward_distance: sum over steps of the reward's term of this name, as all that follow.
+    A column is absent where the task does not tell it. Bool columns say whether something ever happened in the episode.
     """
 
-    discounted_return: NDArray[np.float64]
-    undiscounted_return: NDArray[np.float64]
-    length: NDArray[np.int64]
-    success: NDArray[np.bool_] | None = None
-    diverged: NDArray[np.bool_] | None = None
-    tip_travel_distance: NDArray[np.float64] | None = None
-    final_distance: NDArray[np.float64] | None = None
-    torque_per_agent: NDArray[np.float64] | None = None
-    torque_joint: NDArray[np.float64] | None = None
-    contact_steps: NDArray[np.int64] | None = None
-    discovered_bins: NDArray[np.int64] | None = None
-    dropped_bins: NDArray[np.int64] | None = None
-    reward_distance: NDArray[np.float64] | None = None
-    reward_progress: NDArray[np.float64] | None = None
-    reward_smoothness: NDArray[np.float64] | None = None
-    reward_time: NDArray[np.float64] | None = None
-    reward_collision: NDArray[np.float64] | None = None
-    reward_discovery: NDArray[np.float64] | None = None
-    reward_stuck: NDArray[np.float64] | None = None
-    reward_success: NDArray[np.float64] | None = None
+    def __init__(self, columns: Mapping[str, Values]) -> None:
+        """Hold columns of equal lengths, in the order of the table of entries."""
+        known = [column.name for column in entries.EPISODE_COLUMNS]
+        self._columns = {name: columns[name] for name in known if name in columns}
+
+    def __getitem__(self, name: str) -> Values:
+        """Give a column."""
+        return self._columns[name]
+
+    def __iter__(self) -> Iterator[str]:
+        """Go through the names of the columns."""
+        return iter(self._columns)
+
+    def __len__(self) -> int:
+        """Give the number of columns."""
+        return len(self._columns)
+
+    @property
+    def episodes(self) -> int:
+        """The number of episodes."""
+        return len(self["length"])
 
     def rows(self) -> list[dict[str, float | int]]:
-        """One mapping per episode, of plain numbers."""
-        columns = {name: values.tolist() for name, values in asdict(self).items() if values is not None}
+        """Give one mapping per episode, of plain numbers."""
+        columns = {name: values.tolist() for name, values in self.items()}
         return [
             {"episode": index} | {name: values[index] for name, values in columns.items()}
-            for index in range(len(self.length))
+            for index in range(self.episodes)
         ]
 
 
@@ -132,9 +101,8 @@ def evaluate_in_parts(
     for part, first in enumerate(range(0, episodes, size)):
         own = evaluation_seed(seed, part)
         env = build(min(size, episodes - first), own)
-        parts.append(asdict(evaluate(policy, env, deterministic=deterministic, seed=own, gamma=gamma)))
-    columns = {name: [part[name] for part in parts] for name, values in parts[0].items() if values is not None}
-    return EpisodeRecords(**{name: np.concatenate(values) for name, values in columns.items()})
+        parts.append(evaluate(policy, env, deterministic=deterministic, seed=own, gamma=gamma))
+    return EpisodeRecords({name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
 
 
 def evaluation_seed(seed: int, part: int = 0) -> int:
@@ -146,82 +114,88 @@ def _first_episodes(policy: TensorDictModuleBase, env: EnvBase, gamma: float) ->
     data = env.reset()
     alive = torch.ones(env.batch_size, dtype=torch.bool, device=env.device)
     tally: _Tally | None = None
-    blind = dense(alive.device)
+    free = sync.is_free(alive.device)
     for step in itertools.count():
-        if not (blind and step % LOOK_EVERY) and not alive.any():
+        if (free or step % CHECK_EVERY == 0) and not alive.any():
             break
         data = env.step(act(policy, data, alive))
         after = data["next"]
         tally = tally or _Tally(after, gamma)
         tally.add(after, alive)
-        alive = alive & ~after[keys.DONE].squeeze(-1)
+        alive = alive & ~after[entries.DONE].squeeze(-1)
         data = step_mdp(data)
     assert tally is not None
     return tally.records()
 
 
 class _Tally:
-    """Adds up what episodes say of themselves."""
+    """Adds up what episodes say of themselves, in the ways that the table of entries asks for."""
 
     def __init__(self, frame: TensorDictBase, gamma: float) -> None:
         """Begin with nothing; ``frame``, ``(episodes,)``, shows what there is to add up."""
         told = set(frame.keys(include_nested=True))
-        kinds = (SUMMED, COUNTED, HAPPENED, LAST)
-        self._summed, self._counted, self._happened, self._last = (
-            {name: key for name, key in kind.items() if key in told} for kind in kinds
-        )
+
+        def chosen(*reductions: str) -> list[Column]:
+            return [
+                column for column in entries.EPISODE_COLUMNS if column.reduction in reductions and column.key in told
+            ]
+
+        self._summed, self._counted = chosen(entries.DISCOUNTED, entries.SUM, entries.MEAN), chosen(entries.COUNT)
+        self._happened, self._last = chosen(entries.EVER), chosen(entries.LAST, entries.LAST_COUNT)
         (episodes,), device = frame.batch_size, frame.device
+        self._length = torch.zeros((episodes, 1), dtype=torch.int64, device=device)
         self._sums = torch.zeros((episodes, len(self._summed)), dtype=torch.float64, device=device)
         self._weight = torch.ones(len(self._summed), dtype=torch.float64, device=device)
-        self._gamma = gamma
-        self._counts = torch.zeros((episodes, 1 + len(self._counted)), dtype=torch.int64, device=device)
+        discount = [gamma if column.reduction == entries.DISCOUNTED else 1.0 for column in self._summed]
+        self._discount = torch.tensor(discount, dtype=torch.float64, device=device)
+        self._counts = torch.zeros((episodes, len(self._counted)), dtype=torch.int64, device=device)
         self._ever = torch.zeros((episodes, len(self._happened)), dtype=torch.bool, device=device)
         self._ends = torch.zeros((episodes, len(self._last)), dtype=torch.float64, device=device)
 
     def add(self, frame: TensorDictBase, alive: Tensor) -> None:
         """Add a step of the episodes in ``alive``, ``(episodes,)``."""
         going = alive.unsqueeze(-1)
-        self._sums += torch.where(going, _columns(frame, self._summed).double() * self._weight, 0.0)
-        self._weight[0] *= self._gamma
-        self._counts[:, :1] += going
+        self._length += going
+        self._sums += torch.where(going, _side_by_side(frame, self._summed).double() * self._weight, 0.0)
+        self._weight *= self._discount
         if self._counted:
-            self._counts[:, 1:] += going & (_columns(frame, self._counted) > 0)
+            self._counts += going & (_side_by_side(frame, self._counted) > 0)
         if self._happened:
-            self._ever |= going & _columns(frame, self._happened)
+            self._ever |= going & _side_by_side(frame, self._happened)
         if self._last:
-            self._ends = torch.where(going, _columns(frame, self._last).double(), self._ends)
+            self._ends = torch.where(going, _side_by_side(frame, self._last).double(), self._ends)
 
     def records(self) -> EpisodeRecords:
-        """All that has been added."""
-        length = self._counts[:, 0]
-        columns = {
-            **_split(self._summed, self._sums),
-            **_split(("length", *self._counted), self._counts),
-            **_split(self._happened, self._ever),
-            **_split(self._last, self._ends),
-        }
-        columns |= {name: columns[name] / length for name in AVERAGED & columns.keys()}
-        columns |= {name: columns[name].long() for name in WHOLE & columns.keys()}
-        return EpisodeRecords(**{name: values.cpu().numpy() for name, values in columns.items()})
+        """Give all that has been added."""
+        length = self._length.squeeze(-1)
+        columns = {"length": length}
+        tallies = (
+            (self._summed, self._sums),
+            (self._counted, self._counts),
+            (self._happened, self._ever),
+            (self._last, self._ends),
+        )
+        for group, values in tallies:
+            for column, value in zip(group, values.unbind(-1), strict=True):
+                if column.reduction == entries.MEAN:
+                    value = value / length
+                columns[column.name] = value.long() if column.reduction == entries.LAST_COUNT else value
+        return EpisodeRecords({name: values.cpu().numpy() for name, values in columns.items()})
 
 
-def _columns(frame: TensorDictBase, entries: Mapping[str, NestedKey]) -> Tensor:
-    """Entries ``(episodes, 1)`` side by side."""
-    return torch.cat([frame.get(key) for key in entries.values()], dim=-1)
-
-
-def _split(names: Iterable[str], columns: Tensor) -> dict[str, Tensor]:
-    return dict(zip(names, columns.unbind(-1), strict=True))
+def _side_by_side(frame: TensorDictBase, columns: Sequence[Column]) -> Tensor:
+    """Put entries ``(episodes, 1)`` side by side."""
+    return torch.cat([frame.get(column.key) for column in columns], dim=-1)
 
 
 def act(policy: TensorDictModuleBase, data: TensorDictBase, alive: Tensor) -> TensorDictBase:
-    """Actions of the environments whose first episode goes on; zeros, unpaid for, in the others.
+    """Choose the actions of the environments whose first episode goes on; zeros, unpaid for, in the others.
 
-    On a device that a look at ``alive`` waits for, all are paid for.
+    On a device where reading ``alive`` would wait, all are paid for.
     """
-    if dense(alive.device) or alive.all():
+    if not sync.is_free(alive.device) or alive.all():
         return policy(data)
-    action = policy(data[alive])[keys.ACTION]
-    data[keys.ACTION] = action.new_zeros(*alive.shape, *action.shape[1:])
-    data[keys.ACTION][alive] = action
+    action = policy(data[alive])[entries.ACTION]
+    data[entries.ACTION] = action.new_zeros(*alive.shape, *action.shape[1:])
+    data[entries.ACTION][alive] = action
     return data

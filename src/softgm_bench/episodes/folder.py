@@ -11,8 +11,10 @@ from typing import Any
 from softgm_bench.config import GROUPS, UserError, plain
 from softgm_bench.episodes.evaluation import EpisodeRecords
 from softgm_bench.episodes.policy import TrainedPolicy
-from softgm_bench.episodes.summary import summarise, versions
-from softgm_bench.runs.folder import RunFolder, to_json, write_atomically
+from softgm_bench.episodes.summary import summarise
+from softgm_bench.storage.files import to_json, write_atomically
+from softgm_bench.storage.run_folder import RunFolder
+from softgm_bench.storage.versions import versions
 
 
 def default_folder(

@@ -1,8 +1,7 @@
 """Trained policies: read from a run folder, a checkpoint or a file that holds the actor alone."""
 
-import io
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,14 +9,17 @@ import torch
 from omegaconf import OmegaConf
 from tensordict.nn import TensorDictModuleBase
 
-from softgm_bench.algorithms import Algorithm, build_algorithm
-from softgm_bench.algorithms.off_policy import OffPolicy
-from softgm_bench.assembly import build_env
-from softgm_bench.config import Config, UserError, changed, plain, typed, validate, validate_device
+from softgm_bench.assembly import build_policy, check_by_building
+from softgm_bench.config import Config, changed, plain, typed, validate, validate_device
 from softgm_bench.config.explain import USER_ERRORS
-from softgm_bench.envs.vmas import VmasConfig
-from softgm_bench.runs import checkpoint
-from softgm_bench.runs.folder import RunFolder, write_where_asked
+from softgm_bench.envs import Sizes, kind_of
+from softgm_bench.errors import UserError
+from softgm_bench.storage import archive
+from softgm_bench.storage.files import write_where_asked
+from softgm_bench.storage.run_folder import RunFolder
+
+FORMAT = 2  # of a policy's file; 1 was a checkpoint's with nothing but the policy
+NETWORKS = ("actor_network.", "actor_network_params.")  # how losses call the actor, in checkpoints without a policy
 
 
 @dataclass
@@ -25,8 +27,9 @@ class TrainedPolicy:
     """A policy, what it came from, and where it is to act.
 
     Attributes:
-        policy: reads ``keys.OBSERVATION``, writes ``keys.ACTION``; deterministic or exploring as the exploration type
-            says.
+        policy: reads ``entries.OBSERVATION``, writes ``entries.ACTION``; deterministic or exploring as the exploration
+            type says.
+        sizes: of what the policy was trained on.
         config: to act in: the run's, on the device and with the settings that were asked for.
         frames: that it has learnt from.
         versions: of the packages that the run used.
@@ -34,6 +37,7 @@ class TrainedPolicy:
     """
 
     policy: TensorDictModuleBase
+    sizes: Sizes
     config: Config
     frames: int
     versions: dict[str, str]
@@ -46,7 +50,7 @@ class TrainedPolicy:
 
 
 def load(path: Path, device: str = "cpu", overrides: Sequence[str] = ()) -> TrainedPolicy:
-    """The policy in a run folder (its newest checkpoint), a checkpoint or a file that ``save`` wrote.
+    """Read the policy in a run folder (its newest checkpoint), a checkpoint or a file that ``save`` wrote.
 
     Args:
         path: of one of them.
@@ -61,97 +65,84 @@ def load(path: Path, device: str = "cpu", overrides: Sequence[str] = ()) -> Trai
     """
     validate_device(device)
     file = _file(path)
-    state = checkpoint.load(file, device)
+    state = archive.load(file, device)
     try:
         run = typed(OmegaConf.create(state["config"]))
-        trained, slots = _build(_on(run, device))
-        if "policy" in state:
-            trained.policy.load_state_dict(state["policy"])
-        else:
-            trained.load_state_dict(state["algorithm"])
-        _settle(trained, state["frames"])
-        policy = trained.policy
-        result = TrainedPolicy(policy, _on(run, device), state["frames"], state["versions"], run)
+        sizes = Sizes(**state["sizes"]) if "sizes" in state else kind_of(run.task).sizes(run.task)
+        policy = build_policy(run, sizes, state["frames"]).to(torch.device(device))
+        policy.load_state_dict(state["policy"] if "policy" in state else _actor_of(state["algorithm"]["loss"], policy))
+        result = TrainedPolicy(policy, sizes, _on(run, device), state["frames"], state["versions"], run)
     except (KeyError, AttributeError, TypeError, RuntimeError, ValueError, *USER_ERRORS) as error:
         raise UserError(
             f"{file}: this version cannot build its networks; use the version that trained it, with the same plugins"
         ) from error
     if overrides:
         result.config = changed(plain(result.config), overrides)
-        result.policy = _fitted(file, result, slots)
+        result.policy = _fitted(file, result)
     return result
 
 
 def save(trained: TrainedPolicy, path: Path) -> None:
-    """Write what acting needs: the actor's parameters and the configuration; no critic, optimiser or simulation.
+    """Write what acting needs: the actor's parameters, sizes and configuration; no critic, optimiser or simulation.
 
     Raises:
         UserError: the file cannot be written.
     """
-    buffer = io.BytesIO()
-    torch.save(
-        {
-            "format": checkpoint.FORMAT,
-            "frames": trained.frames,
-            "policy": trained.policy.state_dict(),
-            "config": plain(trained.run),
-            "versions": trained.versions,
-        },
-        buffer,
-    )
-    write_where_asked(path, buffer.getvalue())
+    state = {
+        "kind": "policy",
+        "format": FORMAT,
+        "frames": trained.frames,
+        "policy": trained.policy.state_dict(),
+        "sizes": asdict(trained.sizes),
+        "config": plain(trained.run),
+        "versions": trained.versions,
+    }
+    write_where_asked(path, archive.packed(state))
 
 
 def _file(path: Path) -> Path:
     if not path.is_dir():
         return path
-    newest = checkpoint.latest(RunFolder(path).checkpoints)
+    newest = max(RunFolder(path).in_order(), default=None)
     if newest is None:
         raise UserError(f"{path}: no checkpoint here; name a run folder, a checkpoint or a policy's file")
     return newest
 
 
 def _on(config: Config, device: str) -> Config:
-    """The configuration on a device, where the other device's kernel is replaced by its own."""
+    """Put the configuration on a device, where the other device's kernel is replaced by its own."""
     foreign = "cuda" if device == "cpu" else "numba"
     return replace(config, device=device, backend=None if config.backend == foreign else config.backend)
 
 
-def _build(config: Config) -> tuple[Algorithm, int]:
-    """The algorithm with fresh networks, and how many obstacle slots it observes."""
-    env = build_env(config, 1, 0)
-    return build_algorithm(_without_replay(config.algo), config.model, env, config.oracle), env.n_slots
+def _actor_of(loss: Mapping[str, Any], policy: TensorDictModuleBase) -> dict[str, Any]:
+    """Find a policy's parameters among those of the loss that trained it; one that explores wraps the actor."""
+    parameters = {
+        name.removeprefix(prefix): value
+        for name, value in loss.items()
+        for prefix in NETWORKS
+        if name.startswith(prefix)
+    }
+    return {name: parameters[name.removeprefix("actor.")] for name in policy.state_dict()}
 
 
-def _fitted(file: Path, trained: TrainedPolicy, slots: int) -> TensorDictModuleBase:
-    """The trained policy for what is observed in ``trained.config`` instead of ``slots`` obstacle slots."""
-    config, run = trained.config, trained.run
+def _fitted(file: Path, trained: TrainedPolicy) -> TensorDictModuleBase:
+    """Build the trained policy for what is observed in ``trained.config`` instead of the run's task."""
+    config, run, slots = trained.config, trained.run, trained.sizes.n_slots
     task = f"task={config.task.name}"
-    if isinstance(config.task, VmasConfig) is not isinstance(run.task, VmasConfig):
+    if kind_of(config.task) is not kind_of(run.task):
         raise UserError(f"{file}: it was trained on {run.task.name}, whose observations are not those of {task}")
-    validate(replace(config, threads=None))  # the run's may be more than this machine has
-    fitted, found = _build(config)
+    here = replace(config, threads=None)  # the run's may be more than this machine has
+    validate(here)
+    check_by_building(here)
+    sizes = kind_of(config.task).sizes(config.task)
+    fitted = build_policy(config, sizes, trained.frames).to(torch.device(config.device))
     try:
-        fitted.policy.load_state_dict(trained.policy.state_dict())
+        fitted.load_state_dict(trained.policy.state_dict())
     except RuntimeError as error:
-        advice = f": add task.slots={slots}" if slots and found else ""
+        advice = f": add task.slots={slots}" if slots and sizes.n_slots else ""
         raise UserError(
-            f"{file}: its networks read {slots} obstacle slots, {task} with {config.task.n_agents} agents has {found}"
-            f"{advice}"
+            f"{file}: its networks read {slots} obstacle slots, {task} with {config.task.n_agents} agents has "
+            f"{sizes.n_slots}{advice}"
         ) from error
-    _settle(fitted, trained.frames)
-    return fitted.policy
-
-
-def _settle(algorithm: Algorithm, frames: int) -> None:
-    """Let it explore as after so many frames of training, if it is asked to explore."""
-    if isinstance(algorithm, OffPolicy):
-        algorithm.frames = frames
-        algorithm._schedule()
-
-
-def _without_replay(algo: Any) -> Any:
-    """The algorithm's settings with the smallest memory that they admit."""
-    if not hasattr(algo, "replay_capacity"):
-        return algo
-    return replace(algo, replay_capacity=max(algo.batch_size, 2), checkpoint_replay=False)
+    return fitted

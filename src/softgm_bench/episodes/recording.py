@@ -1,7 +1,9 @@
-"""Plays an evaluation until one of its episodes has ended, and keeps everything about that one."""
+"""Record one episode of an evaluation: play all of them until it has ended, and keep everything about that one."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -11,27 +13,44 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from softgm_bench.assembly import build_env
-from softgm_bench.config import UserError, plain
-from softgm_bench.envs import SoftArmEnv, keys
-from softgm_bench.envs.vmas import VmasConfig
+from softgm_bench.config import plain
+from softgm_bench.envs import SoftArmEnv, entries, kind_of
+from softgm_bench.episodes import policy, trajectory
 from softgm_bench.episodes.evaluation import act, evaluation_seed
 from softgm_bench.episodes.policy import TrainedPolicy
-from softgm_bench.episodes.summary import versions
 from softgm_bench.episodes.trajectory import CYLINDER_FIELDS, ROD, Array, Trajectory
+from softgm_bench.errors import UserError
+from softgm_bench.storage.versions import versions
 
-OBSERVED = (*keys.OBSERVATION, keys.PRIVILEGED)
+OBSERVED = (*entries.OBSERVATION, entries.PRIVILEGED)
 
 
-def record_episode(
+def record(
     trained: TrainedPolicy,
     seed: int,
-    episode: int,
-    horizon: int | None,
-    deterministic: bool,
-    attention: bool,
-    episodes: int | None,
+    episode: int = 0,
+    horizon: int | None = None,
+    deterministic: bool = True,
+    attention: bool = False,
+    episodes: int | None = None,
 ) -> Trajectory:
-    """See ``softgm_bench.episodes.trajectory.record``."""
+    """An episode of an evaluation, bit by bit.
+
+    Scenes are drawn for all episodes of an evaluation together, and a network's rounding depends on how many it acts
+    for; so all of them are simulated until this one ends.
+
+    Args:
+        trained: a ``TrainedPolicy``.
+        seed: of the evaluation.
+        episode: number of the episode in the evaluation, from 0.
+        horizon: control steps until an episode ends, the task's by default.
+        deterministic: act by the mode of the policy, otherwise by a sample.
+        attention: record the attention weights too, if the policy has an encoder with attention.
+        episodes: of the evaluation, all at once; ``episode + 1`` by default. Another number gives another episode.
+
+    Raises:
+        UserError: an argument makes no sense, or the task has no arm.
+    """
     episodes = episode + 1 if episodes is None else episodes
     _check(trained, seed, episode, episodes, horizon)
     config = trained.config
@@ -57,6 +76,30 @@ def record_episode(
     return recorder.trajectory(json.loads(json.dumps(plain(config))), info)  # lists for tuples, as a file has them
 
 
+def record_or_load(
+    path: Path,
+    seed: int = 0,
+    episode: int = 0,
+    horizon: int | None = None,
+    deterministic: bool = True,
+    attention: bool = False,
+    episodes: int | None = None,
+    overrides: Sequence[str] = (),
+) -> Trajectory:
+    """The trajectory in an ``.npz`` file; or ``record`` with the policy of a run folder, checkpoint or policy's file.
+
+    ``overrides`` are settings on top of those that the policy was trained with. A file takes none of the arguments.
+
+    Raises:
+        UserError: the source is missing or damaged, or an argument makes no sense.
+    """
+    if path.suffix == ".npz":
+        if overrides:
+            raise UserError(f"{overrides[0]}: {path} is a recorded episode, which takes no settings; name a policy")
+        return trajectory.load(path)
+    return record(policy.load(path, overrides=overrides), seed, episode, horizon, deterministic, attention, episodes)
+
+
 def attention_encoder(policy: nn.Module) -> Any | None:
     """The module of a policy that can tell its attention weights, by ``forward_with_attention``; None without one."""
     return next((module for module in policy.modules() if hasattr(module, "forward_with_attention")), None)
@@ -70,7 +113,7 @@ class _Recorder:
         self.states: dict[str, list[Array]] = {name: [] for name in (*ROD, "contact")}
         self.steps: dict[str, list[Array]] = {"action": [], "tip_force": [], "reward": []}
         self.observation: dict[str, list[Array]] = {}
-        self.terms: dict[str, list[Array]] = {name: [] for name in keys.REWARD_TERM_NAMES}
+        self.terms: dict[str, list[Array]] = {name: [] for name in entries.REWARD_TERM_NAMES}
         self.attention: dict[str, list[Array]] = {}
         self.success = self.diverged = False
 
@@ -88,14 +131,13 @@ class _Recorder:
 
     def step(self, after: TensorDictBase) -> None:
         """Note what a step did and paid."""
-        force = self.env.tip_force
         self.steps["action"].append(self._own(self.env.applied_action))
-        self.steps["tip_force"].append(np.zeros(3) if force is None else self._own(force).astype(np.float64))
-        self.steps["reward"].append(self._own(after[keys.REWARD])[0])
+        self.steps["tip_force"].append(self._own(self.env.tip_force).astype(np.float64))
+        self.steps["reward"].append(self._own(after[entries.REWARD])[0])
         for name, values in self.terms.items():
-            values.append(self._own(after[keys.REWARD_TERMS, name])[0])
-        self.success = bool(self._own(after[keys.SUCCESS])[0])
-        self.diverged = bool(self._own(after[keys.DIVERGED])[0])
+            values.append(self._own(after[entries.REWARD_TERMS, name])[0])
+        self.success = bool(self._own(after[entries.SUCCESS])[0])
+        self.diverged = bool(self._own(after[entries.DIVERGED])[0])
 
     def attend(self, encoder: Any, data: TensorDictBase) -> None:
         """Note the attention weights with which the next actions are chosen."""
@@ -126,7 +168,7 @@ class _Recorder:
         return values[self.row].numpy(force=True).copy()
 
 
-def _play(policy: nn.Module, env: SoftArmEnv, row: int, encoder: Any | None) -> _Recorder:
+def _play(module: nn.Module, env: SoftArmEnv, row: int, encoder: Any | None) -> _Recorder:
     """One episode in every environment, as ``evaluation.evaluate`` has it, until that of ``row`` ends."""
     recorder = _Recorder(env, row)
     data = env.reset()
@@ -135,8 +177,8 @@ def _play(policy: nn.Module, env: SoftArmEnv, row: int, encoder: Any | None) -> 
     while alive[row]:
         if encoder is not None:
             recorder.attend(encoder, data)
-        data = env.step(act(policy, data, alive))
-        alive = alive & ~data["next", keys.DONE].squeeze(-1)
+        data = env.step(act(module, data, alive))
+        alive = alive & ~data["next", entries.DONE].squeeze(-1)
         recorder.step(data["next"])
         data = step_mdp(data)
         recorder.state(data)
@@ -144,7 +186,7 @@ def _play(policy: nn.Module, env: SoftArmEnv, row: int, encoder: Any | None) -> 
 
 
 def _check(trained: TrainedPolicy, seed: int, episode: int, episodes: int, horizon: int | None) -> None:
-    if isinstance(trained.config.task, VmasConfig):
+    if not kind_of(trained.config.task).has_arm:
         raise UserError(f"task={trained.config.task.name}: it has no arm; trajectories are those of an arm")
     if not 0 <= seed < 2**63:
         raise UserError(f"seed={seed}: a seed is a whole number from 0 to 2**63 - 1")

@@ -1,50 +1,33 @@
 """What an evaluation says in numbers, ``summary.json`` and the table at a run's end."""
 
 import math
-import platform
 from collections.abc import Mapping
-from importlib.metadata import version
 from typing import Any
 
 import numpy as np
 
-from softgm_bench.envs import keys
 from softgm_bench.episodes.evaluation import EpisodeRecords
 
-# Name in the summary, field of the records; a reader's table leaves out what the reward is made of.
-AVERAGED = {
-    "discounted_return": "discounted_return",
-    "undiscounted_return": "undiscounted_return",
-    "episode_length": "length",
-    "tip_travel_distance": "tip_travel_distance",
-    "final_distance": "final_distance",
-    "torque_per_agent": "torque_per_agent",
-    "torque_joint": "torque_joint",
-    "contact_steps": "contact_steps",
-    "discovered_bins": "discovered_bins",
-    "dropped_bins": "dropped_bins",
-    **{f"reward_{name}": f"reward_{name}" for name in keys.REWARD_TERM_NAMES},
-}
+RENAMED = {"length": "episode_length"}  # columns that summaries know by another name
 
 
 def summarise(records: EpisodeRecords) -> dict[str, Any]:
-    """Mean and standard deviation (over the episodes, population) of every metric; success rate with 95 % interval.
+    """Compute mean and standard deviation (over the episodes, population) of every column.
 
-    What the records do not tell is absent.
+    Of what happened or did not there is the success rate with its 95 % interval, and otherwise the number of episodes.
     """
-    episodes = len(records.length)
-    metrics: dict[str, Any] = {"episodes": episodes}
-    if records.success is not None:
-        successes = int(records.success.sum())
-        low, high = wilson_interval(successes, episodes)
-        metrics["success_rate"] = {"mean": successes / episodes, "low": low, "high": high}
-    if records.diverged is not None:
-        metrics["diverged"] = int(records.diverged.sum())
-    for name, field in AVERAGED.items():
-        values = getattr(records, field)
-        if values is not None:
-            metrics[name] = {"mean": float(np.mean(values)), "std": float(np.std(values))}
-    return metrics
+    metrics: dict[str, Any] = {"episodes": records.episodes}
+    numbers: dict[str, Any] = {}
+    for name, values in records.items():
+        if name == "success":
+            successes = int(values.sum())
+            low, high = wilson_interval(successes, records.episodes)
+            metrics["success_rate"] = {"mean": successes / records.episodes, "low": low, "high": high}
+        elif values.dtype == np.bool_:
+            metrics[name] = int(values.sum())
+        else:
+            numbers[RENAMED.get(name, name)] = {"mean": float(np.mean(values)), "std": float(np.std(values))}
+    return metrics | numbers
 
 
 def wilson_interval(successes: int, trials: int, z: float = 1.959963984540054) -> tuple[float, float]:
@@ -56,23 +39,18 @@ def wilson_interval(successes: int, trials: int, z: float = 1.959963984540054) -
     return max(0.0, (centre - margin) / scale), min(1.0, (centre + margin) / scale)
 
 
-def versions() -> dict[str, str]:
-    """Versions of everything that a number may depend on."""
-    packages = ("softgm_bench", "torch", "torchrl", "tensordict", "numba", "numpy")
-    return {"python": platform.python_version()} | {package: version(package) for package in packages}
-
-
 def table(metrics: Mapping[str, Any], title: str) -> str:
     """The metrics of ``summarise`` for a reader."""
     rows = []
     if (success := metrics.get("success_rate")) is not None:
         rows.append(("success rate", f"{success['mean']:.3f}  [{success['low']:.3f}, {success['high']:.3f}]"))
     rows += [
-        (name.replace("_", " "), f"{metrics[name]['mean']:.3f} +- {metrics[name]['std']:.3f}")
-        for name in AVERAGED
-        if name in metrics and not name.startswith("reward_")
+        (name.replace("_", " "), f"{value['mean']:.3f} +- {value['std']:.3f}")
+        for name, value in metrics.items()
+        if isinstance(value, Mapping) and "std" in value and not name.startswith("reward_")
     ]
-    rows += [(name, str(metrics[name])) for name in ("diverged", "episodes") if name in metrics]
+    counts = {name: value for name, value in metrics.items() if isinstance(value, int) and name != "episodes"}
+    rows += [(name, str(value)) for name, value in (counts | {"episodes": metrics["episodes"]}).items()]
     width = max(len(name) for name, _ in rows)
     lines = [f"  {name:<{width}}  {value}" for name, value in rows]
     return "\n".join([title, *lines])

@@ -2,7 +2,7 @@
 
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softgm_bench.config import UserError
+from softgm_bench.errors import UserError
 from softgm_bench.rod.actuation import control_points
 from softgm_bench.rod.parameters import RodParameters, rod_constants
-from softgm_bench.runs.folder import write_where_asked
+from softgm_bench.storage.files import read_where_asked, write_where_asked
 
 FORMAT = 1
 CYLINDER_FIELDS = ("start", "axis", "length", "radius")
@@ -82,7 +82,7 @@ class Trajectory:
             "velocity": (steps + 1, 3, n + 1),
             "omega": (steps + 1, 3, n),
             "contact": (steps + 1, n + 1),
-            "action": (steps, n_agents, 2),
+            "action": (steps, n_agents, self.action.shape[-1]),
             "tip_force": (steps, 3),
             "reward": (steps,),
             "target": (3,),
@@ -151,10 +151,7 @@ def load(path: Path) -> Trajectory:
     Raises:
         UserError: the file is missing, damaged or no trajectory of this version.
     """
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise UserError(f"{path}: {error.strerror}") from error
+    content = read_where_asked(path)
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as members:
             arrays: dict[str, Any] = {name: members[name] for name in members.files}  # reading compares checksums
@@ -170,63 +167,6 @@ def load(path: Path) -> Trajectory:
         raise
     except Exception as error:  # damage shows as a BadZipFile, zlib.error, ValueError, KeyError, TypeError and more
         raise UserError(f"{path}: damaged or no trajectory; record it again") from error
-
-
-def record(
-    trained: Any,
-    seed: int,
-    episode: int = 0,
-    horizon: int | None = None,
-    deterministic: bool = True,
-    attention: bool = False,
-    episodes: int | None = None,
-) -> Trajectory:
-    """An episode of an evaluation, bit by bit.
-
-    Scenes are drawn for all episodes of an evaluation together, and a network's rounding depends on how many it acts
-    for; so all of them are simulated until this one ends.
-
-    Args:
-        trained: a ``TrainedPolicy``.
-        seed: of the evaluation.
-        episode: number of the episode in the evaluation, from 0.
-        horizon: control steps until an episode ends, the task's by default.
-        deterministic: act by the mode of the policy, otherwise by a sample.
-        attention: record the attention weights too, if the policy has an encoder with attention.
-        episodes: of the evaluation, all at once; ``episode + 1`` by default. Another number gives another episode.
-
-    Raises:
-        UserError: an argument makes no sense, or the task has no arm.
-    """
-    from softgm_bench.episodes.recording import record_episode  # late: reading a file need not wait for torch
-
-    return record_episode(trained, seed, episode, horizon, deterministic, attention, episodes)
-
-
-def record_or_load(
-    path: Path,
-    seed: int = 0,
-    episode: int = 0,
-    horizon: int | None = None,
-    deterministic: bool = True,
-    attention: bool = False,
-    episodes: int | None = None,
-    overrides: Sequence[str] = (),
-) -> Trajectory:
-    """The trajectory in an ``.npz`` file; or ``record`` with the policy of a run folder, checkpoint or policy's file.
-
-    ``overrides`` are settings on top of those that the policy was trained with. A file takes none of the arguments.
-
-    Raises:
-        UserError: the source is missing or damaged, or an argument makes no sense.
-    """
-    if path.suffix == ".npz":
-        if overrides:
-            raise UserError(f"{overrides[0]}: {path} is a recorded episode, which takes no settings; name a policy")
-        return load(path)
-    from softgm_bench.episodes import policy
-
-    return record(policy.load(path, overrides=overrides), seed, episode, horizon, deterministic, attention, episodes)
 
 
 def describe(info: Mapping[str, Any]) -> str:

@@ -15,8 +15,9 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
-from softgm_bench.envs import keys
-from softgm_bench.models.heads import ACTIONS, feedforward, input_keys, privileged
+from softgm_bench.envs import entries
+from softgm_bench.envs.interface import Sizes
+from softgm_bench.models.heads import feedforward, input_keys, privileged
 from softgm_bench.models.mlp import MLPConfig
 from softgm_bench.models.registry import Encoder, TeamEncoder, build_encoder, build_team_encoder
 
@@ -30,7 +31,7 @@ class ActionValueConfig:
     Attributes:
         widths: hidden layers, each followed by tanh.
         mlp: the critic's encoder is this MLP, whatever the actor's; None: the same model as the actor's.
-        asymmetric: the head reads ``keys.PRIVILEGED`` too. Only training has a critic, so execution does not need it.
+        asymmetric: the head reads ``entries.PRIVILEGED`` too. Only training has a critic, so execution does not need it.
     """
 
     widths: list[int]
@@ -39,37 +40,37 @@ class ActionValueConfig:
 
 
 class AgentActionValue(TensorDictModuleBase):
-    """Reads ``keys.OBSERVATION`` and ``keys.ACTION``, writes a value per agent in ``ACTION_VALUE`` ``(..., N, 1)``."""
+    """Reads ``entries.OBSERVATION`` and ``entries.ACTION``, writes a value per agent in ``ACTION_VALUE`` ``(..., N, 1)``."""
 
-    def __init__(self, encoder: Encoder, config: ActionValueConfig, n_privileged: int = 0) -> None:
-        """Put f_Q on an encoder."""
+    def __init__(self, encoder: Encoder, actions: int, config: ActionValueConfig, n_privileged: int = 0) -> None:
+        """Put f_Q on an encoder; ``actions`` is A, the numbers in one agent's action."""
         super().__init__()
-        self.in_keys, self.out_keys = [*input_keys(encoder, n_privileged), keys.ACTION], [ACTION_VALUE]
+        self.in_keys, self.out_keys = [*input_keys(encoder, n_privileged), entries.ACTION], [ACTION_VALUE]
         self.encoder, self.n_privileged = encoder, n_privileged
-        in_features = encoder.own_features + encoder.out_features + ACTIONS + n_privileged
+        in_features = encoder.own_features + encoder.out_features + actions + n_privileged
         self.function = feedforward(in_features, config.widths, 1, last_gain=1.0)
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write ``ACTION_VALUE``."""
         own = self.encoder.own(td)
         known = privileged(td, self.n_privileged, own).unsqueeze(-2).expand(*own.shape[:-1], self.n_privileged)
-        inputs = torch.cat([own, self.encoder(td), td.get(keys.ACTION), known], dim=-1)
+        inputs = torch.cat([own, self.encoder(td), td.get(entries.ACTION), known], dim=-1)
         return td.set(ACTION_VALUE, self.function(inputs))
 
 
 class TeamActionValue(TensorDictModuleBase):
-    """Reads ``keys.OBSERVATION`` and ``keys.ACTION``, writes its value N times in ``ACTION_VALUE`` ``(..., N, 1)``."""
+    """Reads ``entries.OBSERVATION`` and ``entries.ACTION``, writes its value N times in ``ACTION_VALUE`` ``(..., N, 1)``."""
 
     def __init__(self, encoder: TeamEncoder, n_agents: int, config: ActionValueConfig, n_privileged: int = 0) -> None:
         """Put f_Q on an encoder whose further inputs are the actions, then the privileged channels."""
         super().__init__()
-        self.in_keys, self.out_keys = [*input_keys(encoder, n_privileged), keys.ACTION], [ACTION_VALUE]
+        self.in_keys, self.out_keys = [*input_keys(encoder, n_privileged), entries.ACTION], [ACTION_VALUE]
         self.encoder, self.n_agents, self.n_privileged = encoder, n_agents, n_privileged
         self.function = feedforward(encoder.out_features, config.widths, 1, last_gain=1.0)
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write ``ACTION_VALUE``."""
-        action = td.get(keys.ACTION)
+        action = td.get(entries.ACTION)
         further = torch.cat([action.flatten(-2), privileged(td, self.n_privileged, action)], dim=-1)
         value = self.function(self.encoder(td, further)).unsqueeze(-2)
         return td.set(ACTION_VALUE, value.expand(*value.shape[:-2], self.n_agents, 1))
@@ -77,18 +78,17 @@ class TeamActionValue(TensorDictModuleBase):
 
 def build_action_value(
     encoder_config: Any,
-    n_agents: int,
-    n_slots: int,
+    sizes: Sizes,
     config: ActionValueConfig,
     centralised: bool,
     n_privileged: int = 0,
 ) -> AgentActionValue | TeamActionValue:
-    """A critic of actions with an encoder of its own, for N agents and M slots.
+    """A critic of actions with an encoder of its own, for an environment's sizes.
 
-    With ``n_privileged`` above 0 it reads ``keys.PRIVILEGED`` too.
+    With ``n_privileged`` above 0 it reads ``entries.PRIVILEGED`` too.
     """
     encoder_config = config.mlp or encoder_config
     if not centralised:
-        return AgentActionValue(build_encoder(encoder_config, n_agents, n_slots), config, n_privileged)
-    encoder = build_team_encoder(encoder_config, n_agents, n_slots, n_agents * ACTIONS + n_privileged)
-    return TeamActionValue(encoder, n_agents, config, n_privileged)
+        return AgentActionValue(build_encoder(encoder_config, sizes), sizes.action, config, n_privileged)
+    encoder = build_team_encoder(encoder_config, sizes, sizes.n_agents * sizes.action + n_privileged)
+    return TeamActionValue(encoder, sizes.n_agents, config, n_privileged)

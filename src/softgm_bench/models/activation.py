@@ -5,6 +5,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from softgm_bench.upstream import functorch
+
 
 class _Tanh(torch.autograd.Function):
     """tanh x = 2 sigmoid(2 x) - 1: torch 2.13 vectorises the sigmoid with a fast exponential, the tanh without."""
@@ -25,7 +27,7 @@ def tanh(x: Tensor) -> Tensor:
     """tanh x within a few units of rounding at 1, absolutely: not for what is close to 0 and matters there."""
     # A function that vmap can take has a ``setup_context``; torch then inspects the signature of ``forward`` at every
     # call, for 0.1 ms, where a layer of a small network takes half of one. Hence torch's own under vmap and its like.
-    return torch.tanh(x) if torch._C._are_functorch_transforms_active() else _Tanh.apply(x)
+    return torch.tanh(x) if functorch.transforms_active() else _Tanh.apply(x)
 
 
 class Tanh(nn.Module):

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from softgm_bench.models.chain_kernel import ChainAttention
+from softgm_bench.upstream import functorch
 
 NEGATIVE_SLOPE = 0.2  # of LeakyReLU, as in Velickovic et al. 2018; the paper gives none
 
@@ -164,7 +165,7 @@ class GraphAttention(nn.Module):
 
     def _compiles(self, values: Tensor) -> bool:
         """Whether ``ChainAttention`` can do it: the paper's scores, on a CPU, under no transformation such as vmap."""
-        plain = not torch._C._functorch.is_functorch_wrapped_tensor(values)
+        plain = not functorch.is_wrapped(values)
         return plain and not self.gatv2 and values.device.type == "cpu"
 
     def output(self, aggregated: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from softgm_bench.envs import keys
+from softgm_bench.envs import entries
 from softgm_bench.envs.views import (
     CHANNELS,
     agent_channels,
@@ -57,8 +57,8 @@ def slot_features(td: TensorDictBase) -> Tensor:
 
 def node_types(td: TensorDictBase) -> Tensor:
     """AGENT, OBSTACLE or PAD of every node, int64 ``(..., N + M)``."""
-    active = td[keys.SLOT_ACTIVE]
-    agents = active.new_full((*active.shape[:-1], td[keys.EDGE].shape[-2]), AGENT, dtype=torch.long)
+    active = td[entries.SLOT_ACTIVE]
+    agents = active.new_full((*active.shape[:-1], td[entries.EDGE].shape[-2]), AGENT, dtype=torch.long)
     slots = torch.full_like(active, PAD, dtype=torch.long).masked_fill_(active, OBSTACLE)
     return torch.cat([agents, slots], dim=-1)
 
@@ -75,7 +75,7 @@ def full_adjacency(td: TensorDictBase) -> Tensor:
     Agents hear their neighbours on the chain and the obstacles that they sense; slots hear nobody. Self-loops belong
     to the stages, not to A_t.
     """
-    edge = td[keys.EDGE]
+    edge = td[entries.EDGE]
     n_agents, n_slots = edge.shape[-2:]
     adjacency = edge.new_zeros((*edge.shape[:-2], n_agents + n_slots, n_agents + n_slots))
     adjacency[..., :n_agents, :n_agents] = chain_adjacency(n_agents, edge.device)
@@ -106,7 +106,7 @@ class Sensed(NamedTuple):
 
 def sense(td: TensorDictBase) -> Sensed | None:
     """Gather what the entity -> agent edges need; None if there is no edge. Leading dimensions are packed into B."""
-    edge = td[keys.EDGE]
+    edge = td[entries.EDGE]
     n_agents, n_slots = edge.shape[-2:]
     position = edge.reshape(-1).nonzero().squeeze(-1)
     if position.numel() == 0:
@@ -121,7 +121,7 @@ def sense(td: TensorDictBase) -> Sensed | None:
     rank.index_copy_(0, rows, torch.arange(rows.numel(), device=rows.device))
 
     environment = rows // n_slots
-    descriptor = td[keys.SLOT_DESCRIPTOR].flatten(0, -2).index_select(0, rows)
-    goal = td[keys.TARGET].reshape(-1, 3).index_select(0, environment)
-    tip = td[keys.TIP].reshape(-1, 3).index_select(0, environment)
+    descriptor = td[entries.SLOT_DESCRIPTOR].flatten(0, -2).index_select(0, rows)
+    goal = td[entries.TARGET].reshape(-1, 3).index_select(0, environment)
+    tip = td[entries.TIP].reshape(-1, 3).index_select(0, environment)
     return Sensed(obstacle_channels(descriptor, goal, tip), rank.index_select(0, row), target, slot)

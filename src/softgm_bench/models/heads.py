@@ -1,7 +1,7 @@
 """From embeddings to TorchRL actors and critics; the same heads for every encoder.
 
 Each network reads the observation from the tensordict itself: an encoder and its head cost one module call. A head
-that is built with ``n_privileged`` above 0 reads that many channels of ``keys.PRIVILEGED`` too: an asymmetric critic's
+that is built with ``n_privileged`` above 0 reads that many channels of ``entries.PRIVILEGED`` too: an asymmetric critic's
 or an oracle's. No encoder ever does.
 """
 
@@ -20,14 +20,14 @@ from tensordict.nn import (
     TensorDictModuleBase,
 )
 from torch import Tensor, nn
-from torchrl.modules import TanhNormal
 
-from softgm_bench.envs import keys
+from softgm_bench.envs import entries
+from softgm_bench.envs.interface import Sizes
 from softgm_bench.models.activation import Tanh
 from softgm_bench.models.mlp import MLPConfig
 from softgm_bench.models.registry import Encoder, TeamEncoder, build_encoder, build_team_encoder
+from softgm_bench.upstream.squashed_normal import SquashedNormal
 
-ACTIONS = 2  # normal and binormal
 LOC = ("agents", "loc")  # (B, N, 2), before the bound
 SCALE = ("agents", "scale")  # (B, N, 2)
 STATE_VALUE = "state_value"  # (B, 1) of a centralised critic, (B, N, 1) of an independent one
@@ -84,7 +84,7 @@ class ValueConfig:
             ``concat``: all agents side by side, MAPPO's, in the form that the model gives it. An independent critic
             pools nothing.
         mlp: the critic's encoder is this MLP, whatever the actor's; None: the same model as the actor's.
-        asymmetric: the head reads ``keys.PRIVILEGED`` too. Only training has a critic, so execution does not need it.
+        asymmetric: the head reads ``entries.PRIVILEGED`` too. Only training has a critic, so execution does not need it.
     """
 
     widths: list[int]
@@ -104,15 +104,15 @@ class ValueConfig:
 
 def input_keys(encoder: Encoder | TeamEncoder, n_privileged: int) -> list[NestedKey]:
     """Entries that a network on this encoder with ``n_privileged`` privileged channels reads."""
-    return [*encoder.in_keys, keys.PRIVILEGED] if n_privileged else list(encoder.in_keys)
+    return [*encoder.in_keys, entries.PRIVILEGED] if n_privileged else list(encoder.in_keys)
 
 
 def privileged(td: TensorDictBase, n_privileged: int, like: Tensor) -> Tensor:
-    """The channels ``(..., n_privileged)`` of ``keys.PRIVILEGED``, which need not exist where that is 0.
+    """The channels ``(..., n_privileged)`` of ``entries.PRIVILEGED``, which need not exist where that is 0.
 
     ``like``: ``(..., n, m)``, whose leading dimensions and device nothing then has.
     """
-    return td.get(keys.PRIVILEGED) if n_privileged else like[..., 0, :0]
+    return td.get(entries.PRIVILEGED) if n_privileged else like[..., 0, :0]
 
 
 def feedforward(in_features: int, widths: Sequence[int], out_features: int, last_gain: float) -> nn.Sequential:
@@ -147,7 +147,7 @@ class AgentHead(nn.Module):
         """``(..., N, out_features)``."""
         parts = [self.encoder.own(td), self.encoder(td)]
         if self.n_privileged:
-            known = td.get(keys.PRIVILEGED).unsqueeze(-2)
+            known = td.get(entries.PRIVILEGED).unsqueeze(-2)
             parts.append(known.expand(*parts[0].shape[:-1], self.n_privileged))
         return self.function(torch.cat(parts, dim=-1))
 
@@ -155,16 +155,16 @@ class AgentHead(nn.Module):
 class GaussianPolicy(TensorDictModuleBase):
     """Writes the pre-tanh mean ``LOC`` and standard deviation ``SCALE`` of every agent's action, ``(..., N, 2)``."""
 
-    def __init__(self, encoder: Encoder, config: ActorConfig, n_privileged: int = 0) -> None:
-        """Put the policy's head on an encoder."""
+    def __init__(self, encoder: Encoder, actions: int, config: ActorConfig, n_privileged: int = 0) -> None:
+        """Put the policy's head on an encoder; ``actions`` is A, the numbers in one agent's action."""
         super().__init__()
         self.in_keys, self.out_keys = input_keys(encoder, n_privileged), [LOC, SCALE]
-        outputs = 2 * ACTIONS if config.state_dependent_sigma else ACTIONS
+        outputs = 2 * actions if config.state_dependent_sigma else actions
         self.head = AgentHead(encoder, config.widths, outputs, last_gain=0.01, n_privileged=n_privileged)
         self.persistence = config.persistence
         self.low, self.range = math.log(config.min_sigma), math.log(config.max_sigma / config.min_sigma)
         fraction = torch.tensor((math.log(config.initial_sigma) - self.low) / self.range)
-        self.sigma = nn.Parameter(fraction.logit().repeat(ACTIONS))
+        self.sigma = nn.Parameter(fraction.logit().repeat(actions))
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write ``LOC`` and ``SCALE``.
@@ -173,12 +173,13 @@ class GaussianPolicy(TensorDictModuleBase):
         along the parameter plus the network's output. (A clamp would have no gradient beyond a bound and never return.)
         """
         output = self.head(td)
-        loc, sigma = output[..., :ACTIONS], self.sigma
-        if output.shape[-1] > ACTIONS:
-            sigma = sigma + output[..., ACTIONS:]
+        actions = len(self.sigma)
+        loc, sigma = output[..., :actions], self.sigma
+        if output.shape[-1] > actions:
+            sigma = sigma + output[..., actions:]
         if self.persistence:
             # the previous action before its tanh; near the bound it is cut, where atanh has no finite value
-            previous = td.get(keys.PREVIOUS_ACTION).clamp(-0.99, 0.99).atanh()
+            previous = td.get(entries.PREVIOUS_ACTION).clamp(-0.99, 0.99).atanh()
             loc = torch.lerp(loc, previous, self.persistence)
         td.set(LOC, loc)
         td.set(SCALE, (self.low + self.range * sigma.sigmoid()).exp().expand_as(loc))
@@ -223,30 +224,24 @@ class AgentValue(TensorDictModuleBase):
         return td.set(STATE_VALUE, self.head(td))
 
 
-class SquashedNormal(TanhNormal):
-    """TorchRL's ``TanhNormal`` between -1 and 1, which does not ask the device whether these are its bounds."""
-
-    non_trivial_max = non_trivial_min = property(lambda self: False, lambda self, value: None)
-
-
 def build_actor(
-    encoder_config: Any, n_agents: int, n_slots: int, config: ActorConfig, n_privileged: int = 0
+    encoder_config: Any, sizes: Sizes, config: ActorConfig, n_privileged: int = 0
 ) -> ProbabilisticTensorDictSequential:
-    """The squashed Gaussian actor: reads ``keys.OBSERVATION``, writes ``keys.ACTION`` and ``keys.LOG_PROB`` (B, N).
+    """The squashed Gaussian actor: reads ``entries.OBSERVATION``, writes ``entries.ACTION`` and ``entries.LOG_PROB`` (B, N).
 
     It samples unless ``set_exploration_type`` says otherwise. tensordict's module is used and not TorchRL's
     ``ProbabilisticActor``: the latter (0.14.1) stores the log-probability of the pre-tanh sample, which differs from
     that of the stored float32 action by 2 % at |z| = 6 and without limit beyond, so that PPO's ratio of an unchanged
     policy would not be one. Losses that need the exact pathwise sample (SAC) take it from ``get_dist``.
     """
-    policy = GaussianPolicy(build_encoder(encoder_config, n_agents, n_slots), config, n_privileged)
+    policy = GaussianPolicy(build_encoder(encoder_config, sizes), sizes.action, config, n_privileged)
     sample = ProbabilisticTensorDictModule(
         in_keys={"loc": LOC, "scale": SCALE},
-        out_keys=[keys.ACTION],
+        out_keys=[entries.ACTION],
         distribution_class=SquashedNormal,
         distribution_kwargs={"tanh_loc": True, "upscale": config.mean_bound, "event_dims": 1},
         return_log_prob=True,
-        log_prob_key=keys.LOG_PROB,
+        log_prob_key=entries.LOG_PROB,
         default_interaction_type=InteractionType.RANDOM,
     )
     return ProbabilisticTensorDictSequential(policy, sample)
@@ -254,19 +249,18 @@ def build_actor(
 
 def build_value(
     encoder_config: Any,
-    n_agents: int,
-    n_slots: int,
+    sizes: Sizes,
     config: ValueConfig,
     centralised: bool = True,
     n_privileged: int = 0,
 ) -> TeamValue | AgentValue:
-    """A critic with an encoder of its own: reads ``keys.OBSERVATION``, writes ``STATE_VALUE``.
+    """A critic with an encoder of its own: reads ``entries.OBSERVATION``, writes ``STATE_VALUE``.
 
     A centralised critic says one value for the team, (B, 1); an independent one a value per agent, (B, N, 1), of what
-    that agent's actor reads. With ``n_privileged`` above 0 its head reads ``keys.PRIVILEGED`` too.
+    that agent's actor reads. With ``n_privileged`` above 0 its head reads ``entries.PRIVILEGED`` too.
     """
     encoder_config = config.mlp or encoder_config
     if centralised and config.pooling == "concat":
-        return TeamValue(build_team_encoder(encoder_config, n_agents, n_slots, n_privileged), config, n_privileged)
-    encoder = build_encoder(encoder_config, n_agents, n_slots)
+        return TeamValue(build_team_encoder(encoder_config, sizes, n_privileged), config, n_privileged)
+    encoder = build_encoder(encoder_config, sizes)
     return (TeamValue if centralised else AgentValue)(encoder, config, n_privileged)

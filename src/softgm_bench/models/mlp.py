@@ -10,7 +10,8 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.nn import functional
 
-from softgm_bench.envs import keys
+from softgm_bench.envs import entries
+from softgm_bench.envs.interface import Sizes
 from softgm_bench.models import graph
 from softgm_bench.models.activation import tanh
 from softgm_bench.models.registry import Encoder, TeamEncoder, register_model
@@ -37,17 +38,18 @@ class MLPTeamEncoder(TeamEncoder):
     What the agents' flat observations share, the slots, is read once. It costs a critic N times less than N embeddings.
     """
 
-    def __init__(self, config: MLPConfig, n_agents: int, n_slots: int, n_further: int) -> None:
+    def __init__(self, config: MLPConfig, sizes: Sizes, n_further: int) -> None:
         """Draw the parameters for N agents, M slots and ``n_further`` inputs besides."""
         super().__init__(config.hidden)
         self.velocity_scale = config.velocity_scale
-        in_features = n_agents * (graph.CHANNELS + n_slots) + n_slots * graph.CHANNELS + n_further
+        of_agents = sizes.n_agents * (graph.CHANNELS + sizes.n_slots)
+        in_features = of_agents + sizes.n_slots * graph.CHANNELS + n_further
         self.layers = nn.ModuleList(orthogonal_layers([in_features, *[config.hidden] * config.layers]))
 
     def forward(self, td: TensorDictBase, further: Tensor) -> Tensor:
         """Embeddings ``(..., hidden)`` of own nodes, edges, slots and ``further``, in this order."""
         own = graph.agent_channels(td, self.velocity_scale)
-        edge, slots = td[keys.EDGE].to(own.dtype), graph.slot_channels(td)
+        edge, slots = td[entries.EDGE].to(own.dtype), graph.slot_channels(td)
         hidden = torch.cat([own.flatten(-2), edge.flatten(-2), slots.flatten(-2), further], dim=-1)
         for layer in self.layers:
             hidden = tanh(layer(hidden))
@@ -62,16 +64,16 @@ class MLPEncoder(Encoder):
     multiplies it once per environment and adds the result to every agent's.
     """
 
-    def __init__(self, config: MLPConfig, n_agents: int, n_slots: int) -> None:
-        """Draw the parameters for M = ``n_slots``; none depends on N."""
+    def __init__(self, config: MLPConfig, sizes: Sizes) -> None:
+        """Draw the parameters for M slots; none depends on N."""
         super().__init__(config.hidden, config.velocity_scale)
-        sizes = [graph.flat_features(n_slots), *[config.hidden] * config.layers]
-        self.first, *rest = orthogonal_layers(sizes)
+        widths = [graph.flat_features(sizes.n_slots), *[config.hidden] * config.layers]
+        self.first, *rest = orthogonal_layers(widths)
         self.rest = nn.ModuleList(rest)
 
     def forward(self, td: TensorDictBase) -> Tensor:
-        """Embeddings ``(..., N, hidden)`` from the entries ``keys.OBSERVATION``."""
-        edge = td[keys.EDGE]
+        """Embeddings ``(..., N, hidden)`` from the entries ``entries.OBSERVATION``."""
+        edge = td[entries.EDGE]
         n_slots = edge.shape[-1]
         own = graph.agent_channels(td, self.velocity_scale)
         own_weight, slot_weight, edge_weight = self.first.weight.split(

@@ -7,7 +7,8 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor, nn
 
-from softgm_bench.envs import keys
+from softgm_bench.envs import entries
+from softgm_bench.envs.interface import Sizes
 from softgm_bench.models import graph
 
 
@@ -23,7 +24,7 @@ class Encoder(nn.Module):
         velocity_scale: factor that the encoder applies to the agents' velocities; heads that read them do the same.
     """
 
-    in_keys: ClassVar[tuple[NestedKey, ...]] = keys.OBSERVATION
+    in_keys: ClassVar[tuple[NestedKey, ...]] = entries.OBSERVATION
     own_features: ClassVar[int] = graph.CHANNELS
 
     def __init__(self, out_features: int, velocity_scale: float) -> None:
@@ -49,7 +50,7 @@ class TeamEncoder(nn.Module):
         out_features: length of the embedding.
     """
 
-    def __init__(self, out_features: int, in_keys: tuple[NestedKey, ...] = keys.OBSERVATION) -> None:
+    def __init__(self, out_features: int, in_keys: tuple[NestedKey, ...] = entries.OBSERVATION) -> None:
         """Remember what the heads ask for."""
         super().__init__()
         self.out_features, self.in_keys = out_features, in_keys
@@ -86,7 +87,7 @@ def register_model(
 ) -> Callable[[EncoderClass], EncoderClass]:
     """Class decorator: ``config`` (a dataclass, the schema of ``conf/model/<name>.yaml``) means this encoder.
 
-    The class is called with the configuration, N and M (or F, of a vector). ``team``, called with the number of further
+    The class is called with the configuration and the environment's ``Sizes``. ``team``, called with the number of further
     inputs besides, is the model's own form for centralised critics; without one they put the agents' embeddings side by
     side.
     """
@@ -107,23 +108,23 @@ def model_configs() -> dict[str, type]:
     return dict(_configs)
 
 
-def build_encoder(config: Any, n_agents: int, n_slots: int) -> Encoder:
-    """The encoder that ``config`` means, for N agents and M slots, or F features where an observation is a vector.
+def build_encoder(config: Any, sizes: Sizes) -> Encoder:
+    """Build the encoder that ``config`` means, for an environment's sizes.
 
     Raises:
         ValueError: if ``config`` is no registered model's.
     """
     if type(config) not in _encoders:
         raise ValueError(f"{type(config).__name__} is no model's configuration; models: {sorted(_configs)}")
-    return _encoders[type(config)](config, n_agents, n_slots)
+    return _encoders[type(config)](config, sizes)
 
 
-def build_team_encoder(config: Any, n_agents: int, n_slots: int, n_further: int) -> TeamEncoder:
-    """What the model that ``config`` means offers to centralised critics; ``n_further`` inputs beside observations.
+def build_team_encoder(config: Any, sizes: Sizes, n_further: int) -> TeamEncoder:
+    """Build what the model of ``config`` offers to centralised critics; ``n_further`` inputs beside observations.
 
     Raises:
         ValueError: if ``config`` is no registered model's.
     """
     if type(config) in _team_encoders:
-        return _team_encoders[type(config)](config, n_agents, n_slots, n_further)
-    return SideBySide(build_encoder(config, n_agents, n_slots), n_agents, n_further)
+        return _team_encoders[type(config)](config, sizes, n_further)
+    return SideBySide(build_encoder(config, sizes), sizes.n_agents, n_further)

@@ -18,7 +18,8 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.nn import functional
 
-from softgm_bench.envs import keys
+from softgm_bench.envs import entries
+from softgm_bench.envs.interface import Sizes
 from softgm_bench.models import graph
 from softgm_bench.models.attention import chain_attention, entity_attention, stack_layers
 from softgm_bench.models.gat import GraphAttention
@@ -60,7 +61,7 @@ Record = list[Tensor] | None  # where to leave the attention of each layer
 class SoftGMEncoder(Encoder):
     """From the observation to one embedding g_i per agent."""
 
-    def __init__(self, config: SoftGMConfig, n_agents: int, n_slots: int) -> None:
+    def __init__(self, config: SoftGMConfig, sizes: Sizes) -> None:
         """Draw the parameters; none depends on N or M, which ``forward`` takes from the observation."""
         super().__init__(config.hidden, config.velocity_scale)
         self.config = config
@@ -70,13 +71,13 @@ class SoftGMEncoder(Encoder):
 
         def stage(used: bool) -> nn.ModuleList:
             depth = config.layers if used else 0
-            sizes = (config.hidden, config.hidden, config.heads, config.gatv2)
-            return nn.ModuleList(GraphAttention(*sizes) for _ in range(depth))
+            shape = (config.hidden, config.hidden, config.heads, config.gatv2)
+            return nn.ModuleList(GraphAttention(*shape) for _ in range(depth))
 
         self.stage1, self.stage2 = stage(config.stage1), stage(config.stage2)
 
     def forward(self, td: TensorDictBase) -> Tensor:
-        """Embeddings ``(..., N, hidden)`` from the entries ``keys.OBSERVATION``."""
+        """Embeddings ``(..., N, hidden)`` from the entries ``entries.OBSERVATION``."""
         return self._embed(td, None, None)
 
     def forward_with_attention(self, td: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
@@ -93,7 +94,7 @@ class SoftGMEncoder(Encoder):
 
     def forward_dense(self, td: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """The paper's formulas over all N + M nodes, masked: the reference for ``forward_with_attention``."""
-        n_agents, n_slots = td[keys.EDGE].shape[-2:]
+        n_agents, n_slots = td[entries.EDGE].shape[-2:]
         channels = torch.cat([graph.agent_channels(td, self.velocity_scale), graph.slot_channels(td)], dim=-2)
         nodes = self.input(torch.cat([graph.pad_channels(channels), self.types(graph.node_types(td))], dim=-1))
         lead = nodes.shape[:-2]
@@ -113,7 +114,7 @@ class SoftGMEncoder(Encoder):
 
     def _embed(self, td: TensorDictBase, stage1: Record, stage2: Record) -> Tensor:
         channels = graph.agent_channels(td, self.velocity_scale)
-        shape = td[keys.EDGE].shape[-2:]
+        shape = td[entries.EDGE].shape[-2:]
         agents, pending = self._enter(channels.flatten(0, -2), graph.AGENT)  # packed: (B N, 15 or hidden)
         if len(self.stage1):
             agents = self._entity_stage(td, agents, pending, stage1)
@@ -142,7 +143,7 @@ class SoftGMEncoder(Encoder):
             agents, pending = self._between(out, agents, last=last and not len(self.stage2)), None
             if record is not None:
                 own_weights = out.new_ones(len(out), layer.heads) if own_weights is None else own_weights
-                record.append(entity_attention(own_weights, edge_weights, sensed, td[keys.EDGE].shape[-2:]))
+                record.append(entity_attention(own_weights, edge_weights, sensed, td[entries.EDGE].shape[-2:]))
         return agents
 
     def _agent_stage(self, agents: Tensor, pending: Affine | None, n_agents: int, record: Record) -> Tensor:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
+from softgm_bench.envs.interface import Sizes
 from softgm_bench.envs.vmas import OBSERVATION
 from softgm_bench.models.activation import tanh
 from softgm_bench.models.mlp import orthogonal_layers
@@ -30,11 +31,11 @@ class VectorMLPEncoder(Encoder):
     in_keys = (OBSERVATION,)
     own_features = 0
 
-    def __init__(self, config: VectorMLPConfig, n_agents: int, n_features: int) -> None:
-        """Draw the parameters for observations of F = ``n_features``; none depends on N."""
-        sizes = [n_features, *config.widths]
-        super().__init__(sizes[-1], velocity_scale=1.0)
-        self.layers = nn.ModuleList(orthogonal_layers(sizes))
+    def __init__(self, config: VectorMLPConfig, sizes: Sizes) -> None:
+        """Draw the parameters for observations of F numbers; none depends on N."""
+        widths = [sizes.n_features, *config.widths]
+        super().__init__(widths[-1], velocity_scale=1.0)
+        self.layers = nn.ModuleList(orthogonal_layers(widths))
 
     def own(self, td: TensorDictBase) -> Tensor:
         """Nothing, ``(..., N, 0)``."""

@@ -71,8 +71,9 @@ def main(arguments: list[str]) -> None:
     )
     files = _files(options)
     _check(options, files)
-    from softgm_bench.episodes import trajectory as episodes  # late: what is refused should not wait
-    from softgm_bench.runs.loop import set_threads
+    from softgm_bench.episodes import recording  # late: what is refused should not wait
+    from softgm_bench.episodes import trajectory as episodes
+    from softgm_bench.runs.machine import set_threads
 
     set_threads(options.threads)  # as an evaluation does: rounding depends on it
     if source.suffix == ".npz":
@@ -81,7 +82,7 @@ def main(arguments: list[str]) -> None:
             raise UserError(f"{given[0]}: {source} is recorded already; name a policy to record another episode")
     page = any(file.suffix == ".html" for file in files)
     chosen = {name: getattr(options, name) for name in RECORDING if getattr(options, name) is not None}
-    trajectory = episodes.record_or_load(source, attention=options.attention or page, overrides=overrides, **chosen)
+    trajectory = recording.record_or_load(source, attention=options.attention or page, overrides=overrides, **chosen)
     _check_against(trajectory, options)
     if options.save:
         episodes.save(trajectory, Path(options.save))
@@ -140,7 +141,7 @@ def _write(trajectory: "Trajectory", options: Options, file: Path) -> None:
         camera = default_camera(trajectory) | {name: value for name, value in chosen.items() if value is not None}
         write_html(trajectory, file, camera=camera)
         return
-    from softgm_bench.runs.folder import write_where_asked
+    from softgm_bench.storage.files import write_where_asked
 
     content = _draw(trajectory, options, file.suffix)
     write_where_asked(file, content)

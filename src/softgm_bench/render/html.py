@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from softgm_bench.episodes.trajectory import Trajectory
 from softgm_bench.render import style
 from softgm_bench.render.camera import FIELD_OF_VIEW, MANY, default_direction
-from softgm_bench.runs.folder import write_where_asked
+from softgm_bench.storage.files import write_where_asked
 
 VIEWER = Path(__file__).with_name("viewer")
 SCRIPTS = (

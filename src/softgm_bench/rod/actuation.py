@@ -10,6 +10,7 @@ from softgm_bench.rod.parameters import RodParameters, rod_constants
 
 BASES = ("interpolating", "bspline")
 SCALINGS = ("per_length", "per_element")
+DIRECTIONS = 2  # of a section's couple: normal (d1) and binormal (d2), d_a in the paper
 
 
 def control_points(n_agents: int, base_length: float) -> NDArray[np.float64]:

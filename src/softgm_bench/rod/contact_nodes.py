@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from softgm_bench.rod import sync
 from softgm_bench.rod.contact import element_radius, safe_norm
-from softgm_bench.rod.dense import arrays, dense
 from softgm_bench.rod.state import Cylinders
 
 
@@ -25,11 +25,11 @@ def contact_nodes(position: Tensor, volume: Tensor, cylinders: Cylinders) -> Ten
     Returns:
         bool, ``(num_envs, n_nodes)``.
     """
-    if dense(position.device):
+    if not sync.is_free(position.device):
         return contact_nodes_dense(position, volume, cylinders)
     touching = torch.zeros((position.shape[0], position.shape[2]), dtype=torch.bool)
     values = (position, volume, cylinders.start, cylinders.axis, cylinders.length, cylinders.radius, cylinders.mask)
-    _mark(*arrays(*values, touching))
+    _mark(*sync.arrays(*values, touching))
     return touching
 
 

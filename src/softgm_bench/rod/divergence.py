@@ -4,7 +4,7 @@ import numba
 import torch
 from torch import Tensor
 
-from softgm_bench.rod.dense import arrays, dense
+from softgm_bench.rod import sync
 from softgm_bench.rod.state import RodState, dilatation
 
 
@@ -20,11 +20,11 @@ def diverged(state: RodState, rest_length: Tensor, low: float, high: float) -> T
     Returns:
         bool, ``(num_envs,)``.
     """
-    if dense(state.position.device):
+    if not sync.is_free(state.position.device):
         return diverged_dense(state, rest_length, low, high)
     out = torch.empty(state.position.shape[0], dtype=torch.bool)
     values = (state.position, state.director, state.velocity, state.omega, rest_length)
-    arguments = [*arrays(*values, out), low, high]
+    arguments = [*sync.arrays(*values, out), low, high]
     _find(*arguments)
     return out
 

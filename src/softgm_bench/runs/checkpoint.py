@@ -1,32 +1,30 @@
 """Checkpoints: one file each, written whole or not at all, read without running any code in it."""
 
-import io
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from softgm_bench.config import UserError
-from softgm_bench.runs.folder import write_atomically
+from softgm_bench.errors import UserError
+from softgm_bench.storage import archive
+from softgm_bench.storage.files import write_atomically
+from softgm_bench.storage.run_folder import RunFolder
 
-FORMAT = 1
+FORMATS = (1, 2)  # that can be continued from; 1 had no policy of its own, and the simulation in other entries
 
 
-def save(folder: Path, frames: int, state: Mapping[str, Any], keep: int) -> Path:
-    """Write the state after ``frames`` frames to ``folder`` and remove all but the newest ``keep`` checkpoints.
+def save(folder: RunFolder, frames: int, state: Mapping[str, Any], keep: int) -> Path:
+    """Write the state after ``frames`` frames and remove all but the newest ``keep`` checkpoints.
 
     Checkpoints after more frames go too: they are of a continuation that was given up, because they are damaged.
 
-    ``state`` holds tensors and plain Python values only: it is read back with ``weights_only=True``.
+    ``state`` holds tensors and plain Python values only.
     """
-    buffer = io.BytesIO()  # a full disk then shows as an OSError, which torch's own file writing hides
-    torch.save({"format": FORMAT, "frames": frames, **state}, buffer)
-    path = folder / f"frames-{frames:012d}.pt"
-    write_atomically(path, buffer.getvalue())
-    newest = [other for other in in_order(folder) if other <= path][-keep:]
-    for other in in_order(folder):
+    path = folder.checkpoints / f"frames-{frames:012d}.pt"
+    write_atomically(path, archive.packed({"format": FORMATS[-1], "frames": frames, **state}))
+    newest = [other for other in folder.in_order() if other <= path][-keep:]
+    for other in folder.in_order():
         if other not in newest:
             other.unlink()
     return path
@@ -38,29 +36,14 @@ def load(path: Path, device: str = "cpu") -> dict[str, Any]:
     Raises:
         UserError: the file is missing, damaged or no checkpoint of this program.
     """
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise UserError(f"{path}: {error.strerror}") from error
-    try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            if archive.testzip() is not None:  # torch itself does not look at the checksums
-                raise ValueError("a checksum is wrong")
-        state = torch.load(io.BytesIO(content), map_location=device, weights_only=True)
-    except Exception as error:  # damage shows as a BadZipFile, RuntimeError, EOFError, UnpicklingError and more
-        raise UserError(f"{path}: damaged or no checkpoint; use an older one") from error
-    if not isinstance(state, dict) or state.get("format") != FORMAT:
+    state = archive.load(path, device)
+    if state.get("format") not in FORMATS or "algorithm" not in state:
         raise UserError(f"{path}: no checkpoint of this program, or of another version of it")
     return state
 
 
-def latest(folder: Path) -> Path | None:
-    """The newest checkpoint in ``folder``."""
-    return max(in_order(folder), default=None)
-
-
 def random_state() -> dict[str, Any]:
-    """State of torch's global generators, on which exploration and minibatches draw."""
+    """Give the state of torch's global generators, on which exploration and minibatches draw."""
     return {"cpu": torch.get_rng_state(), "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else []}
 
 
@@ -69,8 +52,3 @@ def set_random_state(state: Mapping[str, Any]) -> None:
     torch.set_rng_state(state["cpu"])
     if state["cuda"] and torch.cuda.is_available():
         torch.cuda.set_rng_state_all(state["cuda"])
-
-
-def in_order(folder: Path) -> list[Path]:
-    """Checkpoints in ``folder``, oldest first."""
-    return sorted(folder.glob("frames-*.pt"))

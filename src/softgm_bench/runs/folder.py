@@ -1,56 +1,18 @@
 """The folder of a run: where its files lie, when a run may begin in it, how a file is written whole."""
 
-import json
-import math
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from omegaconf import OmegaConf
 
-from softgm_bench.config import UserError
+from softgm_bench.errors import UserError
+from softgm_bench.storage.files import wait_for_disk, write_atomically
+from softgm_bench.storage.run_folder import RunFolder
 
 ANEW = "to begin anew, give overwrite=true instead of resume=true"
-
-
-@dataclass(frozen=True)
-class RunFolder:
-    """Paths of a run's files under ``path``."""
-
-    path: Path
-
-    @property
-    def config(self) -> Path:
-        """Every setting, as YAML."""
-        return self.path / "config.yaml"
-
-    @property
-    def metrics(self) -> Path:
-        """One row an iteration."""
-        return self.path / "metrics.csv"
-
-    @property
-    def evaluations(self) -> Path:
-        """One JSON object an evaluation during training."""
-        return self.path / "evaluations.jsonl"
-
-    @property
-    def episodes(self) -> Path:
-        """One row an episode of the final evaluation."""
-        return self.path / "episodes.csv"
-
-    @property
-    def summary(self) -> Path:
-        """The final evaluation; there when the run has finished."""
-        return self.path / "summary.json"
-
-    @property
-    def checkpoints(self) -> Path:
-        """Folder of the newest checkpoints."""
-        return self.path / "checkpoints"
 
 
 def create(run_dir: str, config: Mapping[str, Any], overwrite: bool) -> RunFolder:
@@ -118,52 +80,11 @@ def to_disk(folder: RunFolder) -> None:
     """Wait until the rows and lines written so far would survive a power failure."""
     for path in (folder.metrics, folder.evaluations, folder.path):
         if path.exists():
-            _fsync(path)
-
-
-def write_where_asked(path: Path, content: bytes) -> None:
-    """``write_atomically`` to a file that the user named, whose folder is made.
-
-    Raises:
-        UserError: it cannot be written.
-    """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, content)
-    except OSError as error:
-        raise UserError(f"{path}: {error.strerror}; choose a file that can be written") from error
-
-
-def write_atomically(path: Path, content: bytes) -> None:
-    """Write or replace a file so that, whatever happens, ``path`` holds all of the old content or all of the new."""
-    temporary = path.with_name(f".{path.name}.tmp")
-    try:
-        with temporary.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
-    _fsync(path.parent)
-
-
-def to_json(value: Mapping[str, Any], indent: int | None = None) -> str:
-    """JSON text; numbers that are not finite become null, which JSON has a word for."""
-    return json.dumps(_finite(value), indent=indent, allow_nan=False)
+            wait_for_disk(path)
 
 
 def _yaml(config: Mapping[str, Any]) -> bytes:
     return OmegaConf.to_yaml(OmegaConf.create(dict(config))).encode()
-
-
-def _fsync(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def _lock(descriptor: int, run_dir: str) -> None:
@@ -191,14 +112,6 @@ def _keep_lines(path: Path, count: int) -> None:
         if not all(file.readline().endswith(b"\n") for _ in range(count)):
             raise UserError(f"{path}: what stood there before the checkpoint is missing; {ANEW}")
         file.truncate(file.tell())
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _held_run(folder: RunFolder) -> str:

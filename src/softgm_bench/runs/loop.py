@@ -1,111 +1,32 @@
 """One run: collect, update, evaluate, write down."""
 
-import ctypes
 import math
-import platform
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import numba
-import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 
-from softgm_bench.algorithms import Algorithm, build_algorithm
-from softgm_bench.assembly import build_env
-from softgm_bench.config import Config, UserError, available_threads, plain
-from softgm_bench.envs import SoftArmEnv
-from softgm_bench.envs.vmas import VmasEnv
+from softgm_bench.assembly import build_algorithm, build_env
+from softgm_bench.config import Config, plain
 from softgm_bench.episodes.evaluation import DISCOUNT, EpisodeRecords, evaluate
-from softgm_bench.episodes.summary import summarise, table, versions
-from softgm_bench.runs import checkpoint, resume
-from softgm_bench.runs import folder as run_folder
-from softgm_bench.runs.folder import RunFolder
+from softgm_bench.episodes.summary import summarise, table
+from softgm_bench.errors import UserError
+from softgm_bench.runs import checkpoint, folder, resume
 from softgm_bench.runs.interruption import Interrupted, Interruption
 from softgm_bench.runs.loggers.guarded import Loggers
 from softgm_bench.runs.loggers.video import episode_video
+from softgm_bench.runs.machine import keep_memory, set_threads
 from softgm_bench.runs.metrics import CsvWriter, EpisodeTracker, step_metrics
 from softgm_bench.runs.progress import Progress
+from softgm_bench.runs.run import Run, derive_seeds, frames_per_iteration, total_frames
+from softgm_bench.storage.files import to_json, write_atomically
+from softgm_bench.storage.run_folder import RunFolder
+from softgm_bench.storage.versions import versions
 from softgm_bench.upstream.collector import FrameCollector
-
-M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # glibc's malloc.h
-
-
-class Seeds(NamedTuple):
-    """Independent seeds derived from a run's one."""
-
-    torch: int
-    training: int
-    evaluation: int
-    final_evaluation: int
-
-
-@dataclass
-class Run:
-    """A run under way.
-
-    Attributes:
-        started: when it would have begun if it had never been broken off, on the clock of ``time.perf_counter``.
-        frames: control steps of single environments that the policy has learnt from.
-        evaluations: made so far.
-    """
-
-    config: Config
-    folder: RunFolder
-    seeds: Seeds
-    env: SoftArmEnv | VmasEnv
-    algorithm: Algorithm
-    collector: FrameCollector
-    episodes: EpisodeTracker
-    started: float
-    iteration: int = 0
-    frames: int = 0
-    evaluations: int = 0
-    loggers: Loggers = field(init=False)
-
-    @property
-    def wall_time(self) -> float:
-        """Seconds since the run began, without those between being broken off and going on."""
-        return time.perf_counter() - self.started
-
-    @property
-    def evaluations_due(self) -> int:
-        """How many evaluations ``evaluation.interval`` asks for by now, at most one an iteration."""
-        return min(self.iteration, self.frames // self.config.experiment.evaluation.interval)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Everything that going on needs, and what it belongs to: tensors and plain Python values."""
-        return {
-            "algorithm": self.algorithm.state_dict(),
-            "random": checkpoint.random_state(),
-            "environment": {
-                "generator": self.env.generator_state(),
-                "simulation": self.env.simulation_state().to_dict(),
-                "shown": self.collector.shown(),
-            },
-            "episodes": self.episodes.state_dict(),
-            "counters": {"iteration": self.iteration, "evaluations": self.evaluations, "wall_time": self.wall_time},
-            "config": plain(self.config),
-            "versions": versions(),
-        }
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from a checkpoint: what ``state_dict`` returned, and ``frames``."""
-        self.algorithm.load_state_dict(state["algorithm"])
-        environment, counters = state["environment"], state["counters"]
-        simulation = TensorDict(environment["simulation"], self.env.batch_size, device=self.env.device)
-        self.env.load_simulation_state(simulation)
-        self.env.set_generator_state(environment["generator"])
-        self.collector.show(environment["shown"])
-        self.episodes.load_state_dict(state["episodes"])
-        self.iteration, self.evaluations = counters["iteration"], counters["evaluations"]
-        self.frames = state["frames"]
-        self.started -= counters["wall_time"]
-        checkpoint.set_random_state(state["random"])  # last: nothing draws any more
 
 
 def train(config: Config) -> dict[str, Any]:
@@ -122,7 +43,7 @@ def train(config: Config) -> dict[str, Any]:
         return summary
     run = _build(config)
     try:
-        with run_folder.exclusive(config.run_dir):
+        with folder.exclusive(config.run_dir):
             _begin(run)
             with Loggers(config, run.folder.path, run.frames) as run.loggers:
                 records = _go(run)
@@ -151,32 +72,6 @@ def _go(run: Run) -> EpisodeRecords:
             raise
 
 
-def derive_seeds(seed: int) -> Seeds:
-    """Seeds that share nothing, so that evaluation and training never draw the same targets."""
-    return Seeds(*(int(word) for word in np.random.SeedSequence(seed).generate_state(4)))
-
-
-def set_threads(threads: int | None) -> int:
-    """Let torch and Numba use this many threads, or all there are; returns how many.
-
-    Matrix products on the CPU go to oneDNN. The package's ``__init__`` says why, and why they stay float32.
-    """
-    count = threads or available_threads()
-    # Numba first: when it starts its threads, it sets OpenMP's number of them, which is torch's too
-    numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))
-    torch.set_num_threads(count)
-    torch.backends.mkldnn.matmul.fp32_precision = "bf16"  # type: ignore[attr-defined]
-    return count
-
-
-def keep_memory() -> None:
-    """Let glibc keep freed memory: tensors of a megabyte would otherwise be mapped anew, page by page, at every use."""
-    if platform.libc_ver()[0] == "glibc":
-        libc = ctypes.CDLL(None)
-        libc.mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
-        libc.mallopt(M_MMAP_THRESHOLD, 2**25)  # the largest that glibc accepts
-
-
 def _build(config: Config) -> Run:
     """A run at its beginning; nothing is written yet."""
     started = time.perf_counter()
@@ -186,11 +81,8 @@ def _build(config: Config) -> Run:
     torch.manual_seed(seeds.torch)
     experiment = config.experiment
     env = build_env(config, experiment.num_envs, seeds.training, experiment.train_horizon, training=True)
-    try:
-        algorithm = build_algorithm(config.algo, config.model, env, config.oracle)
-    except ValueError as error:  # settings that do not fit together
-        raise UserError(str(error)) from error
-    collector = FrameCollector(env, algorithm.policy, _frames_per_iteration(config))
+    algorithm = build_algorithm(config, env)
+    collector = FrameCollector(env, algorithm.policy, frames_per_iteration(config))
     episodes = EpisodeTracker(experiment.num_envs, config.device)
     return Run(config, RunFolder(Path(config.run_dir)), seeds, env, algorithm, collector, episodes, started)
 
@@ -200,7 +92,7 @@ def _begin(run: Run) -> None:
     config = run.config
     state = resume.newest_state(config) if config.resume else None
     if state is None:
-        run_folder.create(config.run_dir, plain(config), config.overwrite or config.resume)
+        folder.create(config.run_dir, plain(config), config.overwrite or config.resume)
     else:
         resume.restore(run, state)
 
@@ -230,16 +122,6 @@ def _batches(run: Run) -> Iterator[TensorDictBase]:
     batches = iter(run.collector)
     while run.frames < total_frames(run.config):
         yield next(batches)
-
-
-def total_frames(config: Config) -> int:
-    """Frames of a run: those that are asked for, rounded up to whole iterations."""
-    frames = _frames_per_iteration(config)
-    return -(-config.experiment.total_frames // frames) * frames
-
-
-def _frames_per_iteration(config: Config) -> int:
-    return config.experiment.num_envs * config.experiment.steps_per_batch
 
 
 def _crossed(interval: int, frames: int, new_frames: int) -> bool:
@@ -275,7 +157,7 @@ def _evaluate_if_due(run: Run, interruption: Interruption, progress: Progress) -
     metrics = summarise(records)
     at = {"evaluation": run.evaluations, "iteration": run.iteration, "frames": run.frames, "wall_time": run.wall_time}
     with run.folder.evaluations.open("a") as file:
-        file.write(run_folder.to_json(at | metrics) + "\n")
+        file.write(to_json(at | metrics) + "\n")
     run.loggers.evaluation(run.frames, metrics)
     value, length = metrics["undiscounted_return"]["mean"], metrics["episode_length"]["mean"]
     achieved = f"success {metrics['success_rate']['mean']:.2f}" if "success_rate" in metrics else f"return {value:.2f}"
@@ -284,9 +166,9 @@ def _evaluate_if_due(run: Run, interruption: Interruption, progress: Progress) -
 
 
 def _save(run: Run) -> Path:
-    run_folder.to_disk(run.folder)  # what a checkpoint goes on from must not be lost where it is not
+    folder.to_disk(run.folder)  # what a checkpoint goes on from must not be lost where it is not
     keep = run.config.experiment.checkpoint.keep
-    return checkpoint.save(run.folder.checkpoints, run.frames, run.state_dict(), keep)
+    return checkpoint.save(run.folder, run.frames, run.state_dict(), keep)
 
 
 def _finish(run: Run, records: EpisodeRecords) -> dict[str, Any]:
@@ -309,9 +191,9 @@ def _finish(run: Run, records: EpisodeRecords) -> dict[str, Any]:
         "final_evaluation": metrics,
         "versions": versions(),
     }
-    run_folder.write_atomically(run.folder.summary, (run_folder.to_json(summary, indent=2) + "\n").encode())
+    write_atomically(run.folder.summary, (to_json(summary, indent=2) + "\n").encode())
     print(table(metrics, f"{config.label} on {config.task.name}, seed {config.seed}, {run.frames} frames:"))
     print(f"run folder: {run.folder.path}")
-    video = partial(episode_video, config, run.algorithm.policy, run.frames)
+    video = partial(episode_video, config, run.algorithm.policy, run.env.sizes, run.frames)
     run.loggers.finish(run.frames, metrics, records.rows(), video)
     return summary

@@ -9,7 +9,7 @@ from typing import Self
 import torch
 from tensordict import TensorDictBase
 
-from softgm_bench.envs import keys
+from softgm_bench.envs import entries
 
 Row = Mapping[str, float | int]
 
@@ -59,7 +59,7 @@ class EpisodeTracker:
         Without any such episode the means are NaN. A task without a notion of success has none of that kind.
         """
         after = batch["next"]
-        reward, done = after[keys.REWARD].squeeze(-1), after[keys.DONE].squeeze(-1)
+        reward, done = after[entries.REWARD].squeeze(-1), after[entries.DONE].squeeze(-1)
         returns, lengths = [], []
         for step in range(batch.shape[1]):
             self._return += reward[:, step]
@@ -73,8 +73,8 @@ class EpisodeTracker:
             "episode_return": torch.stack(returns, 1)[done].mean().item(),
             "episode_length": torch.stack(lengths, 1)[done].double().mean().item(),
         }
-        if keys.SUCCESS in after.keys(include_nested=True):
-            success, diverged = (after[key].squeeze(-1)[done] for key in (keys.SUCCESS, keys.DIVERGED))
+        if entries.SUCCESS in after.keys(include_nested=True):
+            success, diverged = (after[key].squeeze(-1)[done] for key in (entries.SUCCESS, entries.DIVERGED))
             row |= {"success_rate": success.double().mean().item(), "diverged": int(diverged.sum())}
         return row
 
@@ -89,20 +89,15 @@ class EpisodeTracker:
 
 
 def step_metrics(batch: TensorDictBase) -> dict[str, float]:
-    """Means over all steps of a batch: every reward term, contact, sensing and torque; of other tasks, the reward."""
+    """Reduce what every step tells over a batch ``(num_envs, steps)``, as the table of entries asks; else the reward."""
     after = batch["next"]
-    if keys.REWARD_TERMS not in after.keys():  # noqa: SIM118
-        return {"reward": after[keys.REWARD].double().mean().item()}
-    means = {f"reward_{name}": after[keys.REWARD_TERMS, name] for name in keys.REWARD_TERM_NAMES}
-    means |= {
-        "tip_distance": after[keys.DISTANCE],
-        "contact_nodes": after[keys.CONTACT_NODES],
-        "discovered_bins": after[keys.DISCOVERED],
-        "torque_per_agent": after[keys.TORQUE_PER_AGENT],
-        "torque_joint": after[keys.TORQUE_JOINT],
+    told = after.keys(include_nested=True)
+    columns = [column for column in entries.ITERATION_COLUMNS if column.key in told]
+    if not columns:
+        return {"reward": after[entries.REWARD].double().mean().item()}
+    return {
+        column.name: (
+            after[column.key].max() if column.reduction == entries.MAX else after[column.key].double().mean()
+        ).item()
+        for column in columns
     }
-    if keys.DIFFICULTY in after.keys(include_nested=True):
-        means["difficulty"] = after[keys.DIFFICULTY]
-    row = {name: value.double().mean().item() for name, value in means.items()}
-    row["dropped_bins"] = after[keys.DROPPED].max().item()
-    return row

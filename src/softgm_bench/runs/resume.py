@@ -8,20 +8,19 @@ import json
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
 from yaml import YAMLError
 
 from softgm_bench.config import Config, UserError, plain, typed
 from softgm_bench.config.explain import USER_ERRORS
-from softgm_bench.episodes.summary import versions
 from softgm_bench.runs import checkpoint
 from softgm_bench.runs import folder as run_folder
-from softgm_bench.runs.folder import ANEW, RunFolder
-
-if TYPE_CHECKING:
-    from softgm_bench.runs.loop import Run
+from softgm_bench.runs.folder import ANEW
+from softgm_bench.runs.run import Run
+from softgm_bench.storage.run_folder import RunFolder
+from softgm_bench.storage.versions import versions
 
 TOTAL_FRAMES = "experiment.total_frames"
 # What a run may be gone on with other values of: no number depends on them (on threads, only the last bits).
@@ -61,7 +60,7 @@ def newest_state(config: Config) -> dict[str, Any] | None:
         UserError: the run has other settings or cannot be read, or all of its checkpoints are damaged.
     """
     folder = RunFolder(Path(config.run_dir))
-    paths = checkpoint.in_order(folder.checkpoints)
+    paths = folder.in_order()
     if paths or folder.config.exists():
         _refuse_other_settings(config, folder)
     for path in reversed(paths):
@@ -78,7 +77,7 @@ def newest_state(config: Config) -> dict[str, Any] | None:
     return None
 
 
-def restore(run: "Run", state: dict[str, Any]) -> None:
+def restore(run: Run, state: dict[str, Any]) -> None:
     """Put a run that has just been built, and the files in its folder, where a checkpoint was written.
 
     Raises:

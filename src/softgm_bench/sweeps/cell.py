@@ -26,7 +26,8 @@ from yaml import YAMLError
 
 from softgm_bench.config import typed, validate
 from softgm_bench.config.explain import USER_ERRORS, explain
-from softgm_bench.runs.folder import RunFolder, to_json, write_atomically
+from softgm_bench.storage.files import to_json, write_atomically
+from softgm_bench.storage.run_folder import RunFolder
 from softgm_bench.sweeps import record as sweep_record
 
 RECORDS = "SOFTGM_SWEEP"  # environment variable: the folder where outcomes go

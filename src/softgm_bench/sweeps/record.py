@@ -19,7 +19,8 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from softgm_bench.runs.folder import RunFolder, to_json, write_atomically
+from softgm_bench.storage.files import to_json, write_atomically
+from softgm_bench.storage.run_folder import RunFolder
 
 DONE, RUNNING, FAILED, STOPPED, MISSING = "done", "running", "failed", "stopped", "missing"
 TAIL = 16_384  # bytes of metrics.csv that hold its last whole row

@@ -1,4 +1,4 @@
-"""Tasks by name; the values of each are in ``conf/task/<name>.yaml``."""
+"""Tasks of the arm by name; the values of each are in ``conf/task/<name>.yaml``."""
 
 from collections.abc import Callable
 from typing import TypeVar

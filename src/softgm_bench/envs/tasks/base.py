@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorClass
 from torch import Tensor
 
-from softgm_bench.rod.dense import dense
+from softgm_bench.rod import sync
 from softgm_bench.rod.state import Cylinders
 
 POOL = 4096  # fewest values among which admissible ones are looked for where nobody may count them
@@ -192,12 +192,12 @@ def redraw_until(
 ) -> Tensor:
     """Rejection sampling for a whole batch: redraw the rejected rows until all are accepted.
 
-    Where nobody may look at values (``dense``) see ``first_accepted``.
+    Where nobody may look at values (``sync.is_free``) see ``first_accepted``.
 
     Raises:
         ValueError: if some rows are still rejected after 1000 rounds: the ranges leave (almost) nothing.
     """
-    if dense(device):
+    if not sync.is_free(device):
         return first_accepted(draw, accept, count)
     values = draw(count)
     for _ in range(1000):

@@ -8,29 +8,15 @@ from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 from tqdm import tqdm
 
 from softgm_bench.config import Config
+from softgm_bench.runs.loggers.interface import Logger, Row
 
 # Means over an iteration's finished episodes: NaN says that there was none, and is left out.
 EPISODE_MEANS = ("episode_return", "episode_length", "success_rate")
-
-Row = Mapping[str, float | int]
-
-
-class Logger(Protocol):
-    """What hears of a run."""
-
-    def log(self, frames: int, values: Row) -> None:
-        """Values by name after so many frames."""
-
-    def finish(self, frames: int, metrics: Row, episodes: Sequence[Row], video: Callable[[], bytes | None]) -> None:
-        """The final evaluation: its metrics by name, one row an episode, and a function that draws an MP4 of one."""
-
-    def close(self, failed: bool) -> None:
-        """Nothing follows."""
 
 
 class Loggers:

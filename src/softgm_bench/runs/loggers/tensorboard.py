@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 from torch.utils.tensorboard import SummaryWriter
 
 from softgm_bench.config import Config, plain
-from softgm_bench.runs.loggers.guarded import Row
+from softgm_bench.runs.loggers.interface import Row
 
 
 def _unless_writing(otherwise: Callable[[Any], Any], failure: threading.ExceptHookArgs) -> None:

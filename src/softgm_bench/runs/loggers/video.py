@@ -6,28 +6,28 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 
 from softgm_bench.config import Config
-from softgm_bench.envs.vmas import VmasConfig
-from softgm_bench.episodes import trajectory
+from softgm_bench.envs import Sizes, kind_of
 from softgm_bench.episodes.policy import TrainedPolicy
-from softgm_bench.episodes.summary import versions
+from softgm_bench.episodes.recording import record
+from softgm_bench.storage.versions import versions
 
 WIDTH, HEIGHT, FPS, LONGEST = 480, 360, 15, 400  # pixels, frames a second of video, control steps
 
 
-def episode_video(config: Config, policy: TensorDictModuleBase, frames: int) -> bytes | None:
+def episode_video(config: Config, policy: TensorDictModuleBase, sizes: Sizes, frames: int) -> bytes | None:
     """An MP4 of an evaluation's first episode, or of its first ``LONGEST`` steps.
 
     None where there is no arm to be drawn, or without the extra ``render``.
     """
-    if isinstance(config.task, VmasConfig) or not all(map(importlib.util.find_spec, ("av", "PIL"))):
+    if not kind_of(config.task).has_arm or not all(map(importlib.util.find_spec, ("av", "PIL"))):
         return None
-    from softgm_bench.render import video  # late, and against the order of the rooms: drawing is an extra
+    from softgm_bench.render import video  # late: drawing is an extra
     from softgm_bench.render.still import Look, Studio
 
     settings = config.experiment.evaluation
     horizon = min(settings.final_horizon or config.task.horizon, LONGEST)
-    trained = TrainedPolicy(policy, config, frames, versions(), config)
-    episode = trajectory.record(trained, config.seed, horizon=horizon, deterministic=settings.deterministic)
+    trained = TrainedPolicy(policy, sizes, config, frames, versions(), config)
+    episode = record(trained, config.seed, horizon=horizon, deterministic=settings.deterministic)
     studio = Studio(episode, Look(width=WIDTH, height=HEIGHT, text=True))
     control_dt = studio.stage.control_dt
     speed = video.natural_speed(episode.steps * control_dt)

@@ -10,7 +10,7 @@ from typing import Any
 import wandb
 
 from softgm_bench.config import Config, plain
-from softgm_bench.runs.loggers.guarded import Row
+from softgm_bench.runs.loggers.interface import Row
 
 INIT_SECONDS, FINISH_SECONDS = 30.0, 120.0  # that a server may take
 

@@ -1,0 +1,74 @@
+"""How the arm's tasks are played: ``SoftArmEnv`` from a run's settings."""
+
+from dataclasses import replace
+
+import torch
+
+from softgm_bench.envs.interface import Kind, Settings, register_kind
+from softgm_bench.envs.perturbation import PerturbationConfig
+from softgm_bench.envs.soft_arm import SoftArmEnv, sizes_of
+from softgm_bench.envs.tasks import TASK_CONFIGS, TaskConfig, make_task
+from softgm_bench.rod.backend import make_backend
+from softgm_bench.rod.parameters import RodParameters
+
+
+def make_env(
+    task_config: TaskConfig,
+    rod_parameters: RodParameters,
+    num_envs: int,
+    seed: int,
+    horizon: int | None = None,
+    device: torch.device | str = "cpu",
+    backend: str | None = None,
+    dtype: torch.dtype = torch.float64,
+    stagger: bool = False,
+    curriculum: bool = False,
+    perturbation: PerturbationConfig | None = None,
+) -> SoftArmEnv:
+    """Build ``num_envs`` environments of one task; see ``SoftArmEnv`` for the arguments.
+
+    ``curriculum``: for training alone, follow the task's if it is enabled; otherwise all scenes are the task's own.
+    ``backend`` is a name that ``make_backend`` knows; None: the fused kernel of the device.
+    """
+    fused = "numba" if torch.device(device).type == "cpu" else "cuda"
+    rod = make_backend(backend or fused, rod_parameters)
+    if not curriculum:
+        task_config = replace(task_config, curriculum=replace(task_config.curriculum, enabled=False))
+    return SoftArmEnv(make_task(task_config), rod, num_envs, seed, horizon, device, dtype, stagger, perturbation)
+
+
+def _build(settings: Settings, num_envs: int, seed: int, horizon: int | None, training: bool) -> SoftArmEnv:
+    return make_env(
+        settings.task,
+        settings.rod,
+        num_envs=num_envs,
+        seed=seed,
+        horizon=horizon,
+        device=settings.device,
+        backend=settings.backend,
+        dtype=getattr(torch, settings.dtype),
+        stagger=training,
+        curriculum=training,
+        perturbation=settings.perturbation,
+    )
+
+
+def _check(settings: Settings) -> None:
+    """Draw one scene on the CPU, where ranges that leave nothing show.
+
+    Raises:
+        ValueError: with one line naming the key, its value and what would be right.
+    """
+    make_task(settings.task).sample(1, torch.Generator())
+
+
+ARM = register_kind(
+    Kind(
+        base=TaskConfig,
+        configs=lambda: TASK_CONFIGS,
+        build=_build,
+        sizes=lambda config: sizes_of(make_task(config)),
+        check=_check,
+        has_arm=True,
+    )
+)

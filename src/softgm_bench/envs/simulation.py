@@ -1,0 +1,302 @@
+"""The arm's simulation: its whole mutable state, and the control step that moves it.
+
+``Simulation`` holds everything that changes, so that a checkpoint is a copy of it (and of the generators). ``Simulator``
+moves it; ``soft_arm`` turns it into TorchRL's environment. On a device other than the CPU nothing here waits for the
+device: see ``softgm_bench.rod.sync``.
+"""
+
+from typing import NamedTuple
+
+import torch
+from tensordict import TensorClass, TensorDictBase
+from torch import Tensor
+
+from softgm_bench.envs.curriculum import Progress, difficulty, first_progress, note_ends
+from softgm_bench.envs.perturbation import Perturbation, PerturbationConfig
+from softgm_bench.envs.sensing import Bins, Sight, SlotTable, bins_per_cylinder, cut_into_bins, empty_table, look
+from softgm_bench.envs.tasks.base import Scene, Task
+from softgm_bench.rod import sync
+from softgm_bench.rod.actuation import DIRECTIONS, Actuation, control_points
+from softgm_bench.rod.backend import Backend
+from softgm_bench.rod.contact_nodes import contact_nodes
+from softgm_bench.rod.divergence import diverged
+from softgm_bench.rod.parameters import rod_constants
+from softgm_bench.rod.state import RodState, straight_rods
+
+
+class Episodes(TensorClass):
+    """The episodes under way, replaced one by one as they end; ``batch_size`` is ``(num_envs,)``.
+
+    Attributes:
+        rod: state of the arm.
+        scene: target and cylinders.
+        bins: the cylinders cut into bins.
+        table: discovered bins.
+        previous_action: as the sections applied it, ``(num_envs, n_agents, 2)`` float32; 0 after a reset.
+        steps: control steps since the reset, ``(num_envs,)`` int64.
+        terminated: success or divergence, ``(num_envs,)`` bool.
+        truncated: the horizon, ``(num_envs,)`` bool.
+        difficulty: of the scene, from 0 to 1, the task's own, ``(num_envs,)`` float32.
+    """
+
+    rod: RodState
+    scene: Scene
+    bins: Bins
+    table: SlotTable
+    previous_action: Tensor
+    steps: Tensor
+    terminated: Tensor
+    truncated: Tensor
+    difficulty: Tensor
+
+
+class Simulation(TensorClass):
+    """Everything of the environments that changes; ``batch_size`` is ``(num_envs,)``.
+
+    Attributes:
+        episodes: under way.
+        progress: where the curriculum stands.
+        push: direction of the disturbance on the tip in the episodes under way, ``(num_envs, 3)``.
+        tip_force: force on the tip in the last control step, N, ``(num_envs, 3)``.
+    """
+
+    episodes: Episodes
+    progress: Progress
+    push: Tensor
+    tip_force: Tensor
+
+
+class Outcome(NamedTuple):
+    """One control step of every environment, beside the state that it led to; ``(num_envs,)`` where nothing is said.
+
+    Attributes:
+        action: as the sections applied it, ``(num_envs, n_agents, 2)``.
+        previous_action: that of the step before, of the same shape.
+        distance: tip to target after the step, m.
+        previous_distance: and before it.
+        tip_step: way of the tip, m.
+        sight: what the agents sense after the step.
+        success: whether the tip is within the task's radius, bool.
+        broken: whether the simulation broke, bool.
+    """
+
+    action: Tensor
+    previous_action: Tensor
+    distance: Tensor
+    previous_distance: Tensor
+    tip_step: Tensor
+    sight: Sight
+    success: Tensor
+    broken: Tensor
+
+
+class Simulator:
+    """Moves ``num_envs`` arms.
+
+    Attributes:
+        state: everything that changes, but for the generators.
+        task: what is drawn.
+        backend: the rod's implementation.
+        perturbation: what goes wrong; None: nothing.
+        n_slots: obstacle slots, M.
+        curriculum: whether scenes follow the task's curriculum.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        backend: Backend,
+        num_envs: int,
+        seed: int,
+        horizon: int,
+        device: torch.device,
+        dtype: torch.dtype,
+        perturbation: PerturbationConfig | None,
+    ) -> None:
+        """Draw the first episodes; arguments as in ``SoftArmEnv``.
+
+        Raises:
+            ValueError: the perturbation is of a section that does not exist.
+        """
+        config, parameters = task.config, backend.parameters
+        self.task, self.backend, self.horizon = task, backend, horizon
+        self.device, self.dtype = device, dtype
+        self.n_slots: int = config.slots if task.max_cylinders else 0
+        self.curriculum: bool = config.curriculum.enabled
+        actuation = config.actuation
+        sections = (config.n_agents, actuation.max_torque, actuation.basis, actuation.scaling)
+        self._actuation = Actuation(parameters, *sections, device=device, dtype=dtype)
+        arc_length = control_points(config.n_agents, parameters.base_length)
+        nodes = torch.as_tensor(arc_length) * (parameters.n_elements / parameters.base_length)
+        self._agent_node = nodes.round().long().to(device)
+        constants = rod_constants(parameters)
+        self._rest_length = torch.as_tensor(constants.rest_length, dtype=dtype, device=device)
+        self._volume = torch.as_tensor(constants.volume, dtype=dtype, device=device)
+        self._n_bins = task.max_cylinders * bins_per_cylinder(task.max_cylinder_length, config.bin_length)
+        self._generator = torch.Generator(device=device)
+        self._generator.manual_seed(seed)
+        self.perturbation: Perturbation | None = None
+        if perturbation is not None and not perturbation.nothing:
+            self.perturbation = Perturbation(perturbation, config.n_agents, seed, device)
+        progress = first_progress(num_envs, device)
+        nothing = torch.zeros((num_envs, 3), dtype=dtype, device=device)
+        fresh, _ = self.fresh(num_envs, progress)
+        self.state = Simulation(
+            episodes=fresh, progress=progress, push=nothing, tip_force=nothing.clone(), batch_size=[num_envs]
+        )
+
+    # generators
+
+    def seed(self, seed: int) -> None:
+        """Begin the random streams that belong to a seed: of scenes, and of what goes wrong."""
+        self._generator.manual_seed(seed)
+        if self.perturbation is not None:
+            self.perturbation.seed(seed)
+
+    def generators(self) -> list[torch.Generator]:
+        """Give the generator of scenes and, with a perturbation, its own."""
+        return [self._generator, *([] if self.perturbation is None else [self.perturbation.generator])]
+
+    def load_state(self, state: TensorDictBase) -> None:
+        """Take over a copy of ``state`` of as many environments of the same task."""
+        if "episodes" in state:
+            self.state.update_(state)
+            return
+        # a checkpoint of before the curriculum and the push belonged to the simulation
+        self.state.episodes.update_(state.exclude("curriculum", "push"))
+        if "curriculum" in state:
+            self.state.progress.update_(state["curriculum"])
+        if "push" in state:
+            self.state.push.copy_(state["push"])
+
+    # episodes begin
+
+    def begin(self, stagger: bool) -> None:
+        """Begin a new episode in every environment; ``stagger`` starts the clocks at random steps."""
+        state = self.state
+        state.episodes, _ = self.fresh(len(state.push), state.progress)
+        if stagger:
+            state.episodes.steps.random_(0, self.horizon, generator=self._generator)
+        state.progress.counting.fill_(not stagger)  # what is cut short says nothing about its scene
+        self._push_anew(None)
+
+    def begin_again(self, mask: Tensor) -> tuple[Tensor | None, Episodes, Sight]:
+        """Replace the episodes in ``mask``, ``(num_envs,)``, by new ones.
+
+        Returns:
+            The replaced rows, and new episodes for these; on a device that must not be waited for, None, and new
+            episodes for all rows, of which those in ``mask`` are used.
+        """
+        state = self.state
+        state.progress.counting.logical_or_(mask)
+        self._push_anew(mask)
+        if not sync.is_free(self.device):
+            fresh, sight = self.fresh(len(mask), state.progress)
+            state.episodes = fresh.where(mask, state.episodes)
+            return None, fresh, sight
+        rows = mask.nonzero().squeeze(-1)
+        fresh, sight = self.fresh(len(rows), state.progress)
+        state.episodes[rows] = fresh
+        return rows, fresh, sight
+
+    def fresh(self, count: int, progress: Progress) -> tuple[Episodes, Sight]:
+        """Make ``count`` episodes at their beginning, scenes drawn from the own generator, and what is sensed there."""
+        config = self.task.config
+        level = difficulty(progress, config.curriculum) if self.curriculum else None
+        scene = self.task.sample(count, self._generator, level).apply(self._real)
+        bins = cut_into_bins(scene.cylinders, config.bin_length, self.task.max_cylinder_length)
+        never = torch.zeros(count, dtype=torch.bool, device=self.device)
+        episodes = Episodes(
+            rod=straight_rods(self.backend.parameters, count, self.dtype, self.device),
+            scene=scene,
+            bins=bins,
+            table=empty_table(count, self.n_slots, self._n_bins, self.device),
+            previous_action=torch.zeros((count, config.n_agents, DIRECTIONS), device=self.device),
+            steps=torch.zeros(count, dtype=torch.int64, device=self.device),
+            terminated=never,
+            truncated=never.clone(),
+            difficulty=torch.ones(count, device=self.device) * (1.0 if level is None else level),
+            batch_size=[count],
+        )
+        sight = self.sense(episodes)
+        episodes.table = sight.table
+        return episodes, sight
+
+    def _push_anew(self, mask: Tensor | None) -> None:
+        if self.perturbation is not None:
+            self.state.push = self.perturbation.begin(self.state.push, mask)
+
+    def _real(self, value: Tensor) -> Tensor:
+        return value.to(self.dtype) if value.is_floating_point() else value
+
+    # a control step
+
+    def step(self, action: Tensor) -> Outcome:
+        """Move every environment whose episode goes on.
+
+        Args:
+            action: what the policies chose, in [-1, 1], ``(num_envs, n_agents, 2)``.
+        """
+        state, config = self.state, self.task.config
+        now = state.episodes
+        rod, target, previous_action = now.rod, now.scene.target, now.previous_action
+        active = ~(now.terminated | now.truncated)
+        force = None
+        if self.perturbation is not None:
+            action = self.perturbation.applied(action)
+            if self.perturbation.config.pushes:
+                state.tip_force = self.perturbation.tip_force(state.push, now.steps, active)
+                force = torch.nn.functional.pad(
+                    state.tip_force.unsqueeze(-1), (self.backend.parameters.n_elements, 0)
+                )  # on the last node
+        cylinders = now.scene.cylinders if self.task.max_cylinders else None
+        couple = self._actuation.couple(action)
+        moved = self.backend.control_step(rod, couple, force=force, cylinders=cylinders, active=active)
+        broken = diverged(moved, self._rest_length, config.min_dilatation, config.max_dilatation)
+        if sync.any_true(broken):
+            moved = rod.where(broken, moved)
+        now.rod, now.previous_action = moved, action
+        now.steps = now.steps + active
+        sight = self.sense(now)
+        now.table = sight.table
+        tip, previous_tip = moved.position[..., -1], rod.position[..., -1]
+        distance = (tip - target).norm(dim=-1)
+        success = (distance < config.success_radius) & ~broken
+        terminated = now.terminated | (active & (success | broken))
+        now.terminated = terminated
+        now.truncated = now.truncated | (active & (now.steps >= self.horizon) & ~terminated)
+        if self.curriculum:
+            ended = active & (terminated | now.truncated)
+            state.progress = note_ends(state.progress, ended, success, config.curriculum)
+        return Outcome(
+            action=action,
+            previous_action=previous_action,
+            distance=distance,
+            previous_distance=(previous_tip - target).norm(dim=-1),
+            tip_step=(tip - previous_tip).norm(dim=-1),
+            sight=sight,
+            success=success,
+            broken=broken,
+        )
+
+    # readings
+
+    def sense(self, episodes: Episodes) -> Sight:
+        """Sense, discover and observe obstacles from the agents' places."""
+        config, scene = self.task.config, episodes.scene
+        position = self.at_agents(episodes.rod.position)
+        return look(position, scene.cylinders, episodes.bins, episodes.table, config.sensing_radius, config.bin_length)
+
+    def at_agents(self, of_nodes: Tensor) -> Tensor:
+        """Select the agents' nodes: ``(num_envs, 3, n_nodes)`` to ``(num_envs, n_agents, 3)``."""
+        return of_nodes.index_select(-1, self._agent_node).transpose(-1, -2)
+
+    def contacts(self, episodes: Episodes) -> Tensor:
+        """Tell which nodes touch a cylinder, ``(num_envs, n_nodes)`` bool."""
+        return contact_nodes(episodes.rod.position, self._volume, episodes.scene.cylinders)
+
+    def count_contacts(self, episodes: Episodes) -> Tensor:
+        """Count the nodes in contact, C_t, ``(num_envs,)`` int64."""
+        if not self.task.max_cylinders:
+            return torch.zeros_like(episodes.steps)
+        return self.contacts(episodes).sum(dim=-1)

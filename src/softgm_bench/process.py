@@ -1,0 +1,23 @@
+"""Environment variables that count only if they are set before torch is loaded, or before its first product.
+
+Entry points call ``prepare`` first; importing the package sets nothing.
+"""
+
+import os
+
+SETTINGS = {
+    # Idle OpenMP threads of torch spin for milliseconds by default, which slows processes that share cores (a sweep, an
+    # evaluation beside a training) tens of times; sleeping at once halves the speed of a process that is alone. Spinning
+    # for microseconds loses neither.
+    "GOMP_SPINCOUNT": "2000",
+    # oneDNN multiplies float32 matrices twice as fast as MKL on AMD's cores (``runs.machine`` chooses it), through a
+    # setting that would let it round them to bfloat16 where the CPU has instructions for that; this forbids it.
+    "ONEDNN_MAX_CPU_ISA": "AVX512_CORE",
+}
+
+
+def prepare() -> None:
+    """Set what the user has not set; ``OMP_WAIT_POLICY`` says how threads wait, too."""
+    for name, value in SETTINGS.items():
+        if not (name == "GOMP_SPINCOUNT" and "OMP_WAIT_POLICY" in os.environ):
+            os.environ.setdefault(name, value)

@@ -1,0 +1,25 @@
+"""Where values may steer the program, and where reading one would make the processors wait for each other.
+
+On a CPU reading a tensor's values is free, so compiled loops skip what is not there. On any other device reading one
+stops both processors until all queued work is done; there the same results come from shapes that do not depend on values.
+Callers ask through this module (``sync.is_free``), so that a test can send the CPU down the other devices' way.
+"""
+
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+
+def is_free(device: torch.device) -> bool:
+    """Tell whether code for this device may read tensors' values without waiting."""
+    return device.type == "cpu"
+
+
+def any_true(mask: Tensor) -> bool:
+    """Tell whether any entry of a bool tensor is true; True without reading it where that would have to wait."""
+    return not is_free(mask.device) or bool(mask.any())
+
+
+def arrays(*tensors: Tensor) -> list[NDArray]:
+    """Give CPU tensors as contiguous NumPy arrays: a compiled loop is compiled anew for every other layout."""
+    return [tensor.detach().contiguous().numpy() for tensor in tensors]

@@ -1,0 +1,43 @@
+"""Settings of the process and the processor: threads, matrix products, memory."""
+
+import ctypes
+import platform
+
+import numba
+import torch
+
+from softgm_bench import process
+from softgm_bench.config import available_threads
+
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # glibc's malloc.h
+
+
+def set_threads(threads: int | None) -> int:
+    """Let torch and Numba use this many threads, or all there are; returns how many.
+
+    Matrix products on the CPU go to oneDNN, twice as fast as MKL on AMD's cores, as long as they stay float32.
+    """
+    process.prepare()
+    count = threads or available_threads()
+    # Numba first: when it starts its threads, it sets OpenMP's number of them, which is torch's too
+    numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))
+    torch.set_num_threads(count)
+    matmul = torch.backends.mkldnn.matmul  # type: ignore[attr-defined]
+    usual, matmul.fp32_precision = matmul.fp32_precision, "bf16"
+    if not _products_are_float32():  # a product came before ``process.prepare``, which then had no effect
+        matmul.fp32_precision = usual
+    return count
+
+
+def keep_memory() -> None:
+    """Let glibc keep freed memory: tensors of a megabyte would otherwise be mapped anew, page by page, at every use."""
+    if platform.libc_ver()[0] == "glibc":
+        libc = ctypes.CDLL(None)
+        libc.mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
+        libc.mallopt(M_MMAP_THRESHOLD, 2**25)  # the largest that glibc accepts
+
+
+def _products_are_float32() -> bool:
+    """Tell whether a product keeps a digit that bfloat16 has no room for."""
+    values = torch.full((64, 64), 1.0 + 2.0**-12)
+    return torch.equal(values @ torch.eye(64), values)
