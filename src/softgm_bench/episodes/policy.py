@@ -12,8 +12,8 @@ from tensordict.nn import TensorDictModuleBase
 
 from softgm_bench.algorithms import Algorithm, build_algorithm
 from softgm_bench.algorithms.off_policy import OffPolicy
-from softgm_bench.assembly import build_env
-from softgm_bench.config import Config, UserError, changed, plain, typed, validate, validate_device
+from softgm_bench.assembly import build_env, check
+from softgm_bench.config import Config, UserError, changed, plain, typed, validate_device
 from softgm_bench.config.explain import USER_ERRORS
 from softgm_bench.envs.vmas import VmasConfig
 from softgm_bench.runs import checkpoint
@@ -129,7 +129,7 @@ def _fitted(file: Path, trained: TrainedPolicy, slots: int) -> TensorDictModuleB
     task = f"task={config.task.name}"
     if isinstance(config.task, VmasConfig) is not isinstance(run.task, VmasConfig):
         raise UserError(f"{file}: it was trained on {run.task.name}, whose observations are not those of {task}")
-    validate(replace(config, threads=None))  # the run's may be more than this machine has
+    check(replace(config, threads=None))  # the run's may be more than this machine has
     fitted, found = _build(config)
     try:
         fitted.policy.load_state_dict(trained.policy.state_dict())
