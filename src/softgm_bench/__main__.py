@@ -10,7 +10,7 @@ import hydra
 from hydra._internal.utils import get_args_parser
 from omegaconf import DictConfig
 
-from softgm_bench.config import UserError, composing, config_directory, typed, validate
+from softgm_bench.config import UserError, composing, config_directory, typed
 from softgm_bench.config.explain import USER_ERRORS, explain
 from softgm_bench.sweeps import cell as sweep_cell
 from softgm_bench.sweeps import launch as sweep
@@ -49,8 +49,10 @@ def _run() -> None:
         began = True
         try:
             config = typed(composed)
-            validate(config)
-            from softgm_bench.runs.loop import train  # late: a refused command need not wait for torch
+            from softgm_bench.assembly import check  # late: what Hydra refuses or prints need not wait for torch
+
+            check(config)
+            from softgm_bench.runs.loop import train
 
             train(config)
         except USER_ERRORS as error:  # Hydra would print a line of its own

@@ -18,7 +18,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from softgm_bench import assembly, plugins
 from softgm_bench.algorithms import Algorithm
 from softgm_bench.assembly import build_env
-from softgm_bench.config import Config, compose
+from softgm_bench.config import Config
 from softgm_bench.envs import entries
 from softgm_bench.episodes import folder as evaluation_folder
 from softgm_bench.episodes import policy, recording
@@ -65,7 +65,7 @@ class Evaluation:
 
 def configure(*overrides: str) -> Config:
     """The checked settings that ``python -m softgm_bench <overrides>`` runs with."""
-    return compose(list(overrides))
+    return assembly.configure(overrides)
 
 
 def make_env(*overrides: str, num_envs: int = 1, seed: int = 0, horizon: int | None = None) -> EnvBase:

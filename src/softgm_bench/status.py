@@ -2,7 +2,7 @@
 
 FOLDER is where runs lie, such as outputs or outputs/full. Settings, with their defaults:
 
-  grid=null   name of a grid in conf/experiments: its cells only, in its order, those that are missing too
+  grid=null   name of a grid in conf/grids: its cells only, in its order, those that are missing too
 
 One line a run: done (success rate with its 95 % interval), running (process, frames), failed (why), stopped (it was
 killed or interrupted; the sweep's command goes on with it), missing.
@@ -69,10 +69,10 @@ def _cells(folder: Path, grid: str) -> list[Path]:
     """Run folders of a grid that was launched into ``folder``."""
     from softgm_bench.sweeps import launch as sweep
 
-    known = sorted(path.stem for path in (config_directory() / "experiments").glob("*.yaml"))
+    known = sorted(path.stem for path in (config_directory() / "grids").glob("*.yaml"))
     if grid not in known:
         raise UserError(f"grid={grid}: no such grid; choose one of {', '.join(known)}")
-    cells, top = sweep.cells([f"+experiments={grid}"])
+    cells, top = sweep.cells([f"+grids={grid}"])
     return [folder / cell.run_dir.relative_to(top) for cell in cells]
 
 

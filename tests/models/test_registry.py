@@ -26,4 +26,4 @@ def test_a_configuration_of_no_model_is_refused():
 
 def test_a_name_is_registered_once():
     with pytest.raises(ValueError, match="registered already"):
-        register_model("softgm", dict)(MLPEncoder)
+        register_model("softgm", config=dict)(MLPEncoder)

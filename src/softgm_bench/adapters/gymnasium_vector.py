@@ -17,7 +17,8 @@ from omegaconf.errors import OmegaConfBaseException
 from tensordict import TensorDictBase
 
 from softgm_bench import plugins
-from softgm_bench.config import UserError, compose, dtype_of
+from softgm_bench.assembly import configure
+from softgm_bench.config import UserError, dtype_of
 from softgm_bench.envs import entries, make_env
 from softgm_bench.envs.soft_arm import SoftArmEnv
 from softgm_bench.envs.tasks import TASKS
@@ -67,7 +68,7 @@ def build_arm(
         (word,) = np.random.SeedSequence().generate_state(1, np.uint64)
         seed = int(word >> np.uint64(1))
     try:
-        config = compose([f"task={task}", *overrides])
+        config = configure([f"task={task}", *overrides])
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(_one_line(error)) from error
     return make_env(

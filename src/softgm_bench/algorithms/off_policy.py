@@ -26,7 +26,7 @@ ADAM_EPSILON = 1e-6  # BenchMARL's
 
 @dataclass
 class OffPolicyConfig:
-    """Hyperparameters of every off-policy algorithm; values and meaning in ``conf/algo/iddpg.yaml``."""
+    """Hyperparameters of every off-policy algorithm; values and meaning in ``conf/algo/common/off_policy.yaml``."""
 
     name: str
     centralised: bool

@@ -85,7 +85,7 @@ class PPOConfig:
             )
 
 
-@register_algorithm("softgm", "softgm_no_stage1", "softgm_no_stage2", "ippo", "mappo", config=PPOConfig)
+@register_algorithm("softgm", "ippo", "mappo", config=PPOConfig)
 class PPO:
     """TorchRL's ``ClipPPOLoss`` and ``GAE`` with an optimiser each for actor and critic.
 

@@ -8,7 +8,8 @@ from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
-from softgm_bench.config import UserError, compose_untyped
+from softgm_bench.config.composition import compose_untyped
+from softgm_bench.errors import UserError
 
 USER_ERRORS = (UserError, HydraException, OmegaConfBaseException, OSError)
 

@@ -126,7 +126,8 @@ def register_kind(kind: Kind) -> Kind:
 
 def task_configs() -> dict[str, type]:
     """Give the configuration dataclass of every task by name."""
-    return {name: config for kind in _kinds for name, config in kind.configs().items()}
+    arms_first = sorted(_kinds, key=lambda kind: not kind.has_arm)
+    return {name: config for kind in arms_first for name, config in kind.configs().items()}
 
 
 def kind_of(config: Any) -> Kind:

@@ -9,8 +9,8 @@ import torch
 from omegaconf import OmegaConf
 from tensordict.nn import TensorDictModuleBase
 
-from softgm_bench.assembly import build_policy, check_by_building
-from softgm_bench.config import Config, changed, plain, typed, validate, validate_device
+from softgm_bench.assembly import build_policy, check
+from softgm_bench.config import Config, changed, plain, typed, validate_device
 from softgm_bench.config.explain import USER_ERRORS
 from softgm_bench.envs import Sizes, kind_of
 from softgm_bench.errors import UserError
@@ -132,9 +132,7 @@ def _fitted(file: Path, trained: TrainedPolicy) -> TensorDictModuleBase:
     task = f"task={config.task.name}"
     if kind_of(config.task) is not kind_of(run.task):
         raise UserError(f"{file}: it was trained on {run.task.name}, whose observations are not those of {task}")
-    here = replace(config, threads=None)  # the run's may be more than this machine has
-    validate(here)
-    check_by_building(here)
+    check(replace(config, threads=None))  # the run's may be more than this machine has
     sizes = kind_of(config.task).sizes(config.task)
     fitted = build_policy(config, sizes, trained.frames).to(torch.device(config.device))
     try:

@@ -56,7 +56,7 @@ class MLPTeamEncoder(TeamEncoder):
         return hidden
 
 
-@register_model("mlp", MLPConfig, team=MLPTeamEncoder)
+@register_model("mlp", config=MLPConfig, team=MLPTeamEncoder)
 class MLPEncoder(Encoder):
     """Parameters shared by all agents; reads ``graph.flat_observation`` without ever forming it.
 

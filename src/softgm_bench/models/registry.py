@@ -1,7 +1,7 @@
 """Which encoder a configuration means: one table, filled by ``register_model``."""
 
 from collections.abc import Callable
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar, get_type_hints
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -83,19 +83,27 @@ _team_encoders: dict[type, Callable[..., TeamEncoder]] = {}
 
 
 def register_model(
-    name: str, config: type, team: Callable[..., TeamEncoder] | None = None
+    *names: str, config: type, team: Callable[..., TeamEncoder] | None = None
 ) -> Callable[[EncoderClass], EncoderClass]:
-    """Class decorator: ``config`` (a dataclass, the schema of ``conf/model/<name>.yaml``) means this encoder.
+    """Class decorator: each of ``names`` means this encoder with a configuration of type ``config``.
 
-    The class is called with the configuration and the environment's ``Sizes``. ``team``, called with the number of further
-    inputs besides, is the model's own form for centralised critics; without one they put the agents' embeddings side by
-    side.
+    ``config`` is a dataclass, the schema of ``conf/model/<name>.yaml`` for every one of the names; where several share
+    it, it has a field ``name: str``. The class is called with the configuration and the environment's ``Sizes``.
+    ``team``, called with the number of further inputs besides, is the model's own form for centralised critics; without
+    one they put the agents' embeddings side by side.
+
+    Raises:
+        ValueError: a name or the configuration is another model's, or it does not say which of several names it has.
     """
 
     def register(encoder: EncoderClass) -> EncoderClass:
-        if name in _configs or config in _encoders:
-            raise ValueError(f"model {name!r} or its configuration {config.__name__} is registered already")
-        _configs[name], _encoders[config] = config, encoder
+        for name in names:
+            if name in _configs or config in _encoders:
+                raise ValueError(f"model {name!r} or its configuration {config.__name__} is registered already")
+        if len(names) > 1 and get_type_hints(config).get("name") is not str:
+            raise ValueError(f"{config.__name__} is shared by {', '.join(names)}: it needs a field name: str")
+        _configs.update(dict.fromkeys(names, config))
+        _encoders[config] = encoder
         if team is not None:
             _team_encoders[config] = team
         return encoder
@@ -104,7 +112,7 @@ def register_model(
 
 
 def model_configs() -> dict[str, type]:
-    """Configuration dataclass of every registered model, by name."""
+    """Configuration dataclass of every registered model, by name; several names may share one."""
     return dict(_configs)
 
 

@@ -31,6 +31,7 @@ class SoftGMConfig:
     """Architecture of SoftGM. Values: ``conf/model/softgm.yaml``.
 
     Attributes:
+        name: of the file in ``conf/model``; the paper's ablations have names of their own.
         hidden: length of a node's embedding, over all heads (paper: 128).
         heads: attention heads; divides ``hidden`` (paper: 4).
         layers: L, attention layers in each stage (paper: 2).
@@ -42,6 +43,7 @@ class SoftGMConfig:
         velocity_scale: factor of the agents' velocity channels at the input (paper: 1).
     """
 
+    name: str
     hidden: int
     heads: int
     layers: int
@@ -57,7 +59,7 @@ Affine = tuple[Tensor, Tensor | None]  # weight and offset of a linear map that 
 Record = list[Tensor] | None  # where to leave the attention of each layer
 
 
-@register_model("softgm", SoftGMConfig)
+@register_model("softgm", "softgm_no_stage1", "softgm_no_stage2", config=SoftGMConfig)
 class SoftGMEncoder(Encoder):
     """From the observation to one embedding g_i per agent."""
 

@@ -24,7 +24,7 @@ class VectorMLPConfig:
     widths: list[int]
 
 
-@register_model("vector_mlp", VectorMLPConfig)
+@register_model("vector_mlp", config=VectorMLPConfig)
 class VectorMLPEncoder(Encoder):
     """Parameters shared by all agents; heads put nothing beside its embeddings."""
 

@@ -6,7 +6,6 @@ that was broken off and gone on with writes the numbers of one that was not, bit
 
 import json
 import sys
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -14,6 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from yaml import YAMLError
 
 from softgm_bench.config import Config, UserError, plain, typed
+from softgm_bench.config.comparison import ABSENT, differences
 from softgm_bench.config.explain import USER_ERRORS
 from softgm_bench.runs import checkpoint
 from softgm_bench.runs import folder as run_folder
@@ -23,8 +23,6 @@ from softgm_bench.storage.run_folder import RunFolder
 from softgm_bench.storage.versions import versions
 
 TOTAL_FRAMES = "experiment.total_frames"
-# What a run may be gone on with other values of: no number depends on them (on threads, only the last bits).
-FREE = ("run_dir", "overwrite", "resume", "threads", "logger", "experiment.checkpoint", TOTAL_FRAMES)
 
 
 def finished(config: Config, frames: int) -> dict[str, Any] | None:
@@ -101,30 +99,22 @@ def _refuse_other_settings(config: Config, folder: RunFolder) -> None:
         UserError: naming the first setting of another value, groups' names first.
     """
     try:
-        held = _flat(plain(typed(cast(DictConfig, OmegaConf.create(folder.config.read_text())))))
+        held = typed(cast(DictConfig, OmegaConf.create(folder.config.read_text())))
     except (ValueError, TypeError, AttributeError, YAMLError, *USER_ERRORS) as error:
         raise UserError(f"{folder.config}: missing or of another version; {ANEW}") from error
-    wanted = _flat(plain(config))
-    if wanted[TOTAL_FRAMES] < held[TOTAL_FRAMES]:
-        raise UserError(f"{TOTAL_FRAMES}={wanted[TOTAL_FRAMES]}: the run has {held[TOTAL_FRAMES]}; it can only grow")
-    free = list(FREE)
+    now, then = config.experiment.total_frames, held.experiment.total_frames
+    if now < then:
+        raise UserError(f"{TOTAL_FRAMES}={now}: the run has {then}; it can only grow")
+    free = [TOTAL_FRAMES]
     if getattr(config.algo, "lr_schedule", "") == "constant":
         free.append("algo.lr_schedule_frames")  # follows total_frames, and nobody reads it
-    for key in sorted(held.keys() | wanted.keys(), key=lambda key: (not key.endswith(".name"), key)):
-        if held.get(key) != wanted.get(key) and not f"{key}.".startswith(tuple(f"{name}." for name in free)):
-            now, then = (_written(values.get(key)) for values in (wanted, held))
-            raise UserError(f"{key}={now}: the run in {folder.path} has {then}; give that, or choose another run_dir")
-
-
-def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Values by dotted key; tuples become lists, as they are in YAML."""
-    flat: dict[str, Any] = {}
-    for name, value in values.items():
-        if isinstance(value, Mapping):
-            flat |= _flat(value, f"{prefix}{name}.")
-        else:
-            flat[prefix + name] = list(value) if isinstance(value, tuple) else value
-    return flat
+    for key, pair in differences(plain(config), plain(held), free).items():
+        now, then = (None if value is ABSENT else value for value in pair)
+        if now != then:
+            raise UserError(
+                f"{key}={_written(now)}: the run in {folder.path} has {_written(then)}; "
+                "give that, or choose another run_dir"
+            )
 
 
 def _written(value: Any) -> str:

@@ -24,8 +24,10 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from softgm_bench.config import typed, validate
+from softgm_bench.config import typed
+from softgm_bench.config.comparison import ABSENT, differences
 from softgm_bench.config.explain import USER_ERRORS, explain
+from softgm_bench.config.upgrade import upgraded
 from softgm_bench.storage.files import to_json, write_atomically
 from softgm_bench.storage.run_folder import RunFolder
 from softgm_bench.sweeps import record as sweep_record
@@ -37,7 +39,6 @@ PARENT = os.getppid()  # of a launcher's worker, while whoever launched it is al
 LOG = "output.log"  # in the run folder: what the training printed
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 DONE, SKIPPED, FAILED, INTERRUPTED = "done", "skipped", "failed", "interrupted"
-NOT_COMPARED = ("run_dir", "overwrite", "resume", "threads", "logger", "experiment.checkpoint")
 PATIENCE = 30.0  # seconds that a training has to save a checkpoint when it is stopped
 POLL = 0.5  # seconds between looks at whether the parent is still there
 
@@ -67,31 +68,18 @@ def run(composed: DictConfig) -> str:
 def finished(values: Mapping[str, Any], run_dir: Path) -> str:
     """What a finished run with these settings achieved; empty if the folder holds none.
 
-    Settings are compared as far as YAML has them, without building anything: what differs is left to ``resume``.
+    Settings are compared as far as both have them, without building anything: what differs is left to ``resume``.
     """
     folder = RunFolder(run_dir)
     try:
         summary = json.loads(folder.summary.read_text())
         held: Any = OmegaConf.to_container(OmegaConf.load(folder.config))
-        if summary["frames"] < values["experiment"]["total_frames"] or _differ(values, held):
+        differ = any(ABSENT not in pair for pair in differences(values, upgraded(held)).values())
+        if differ or summary["frames"] < values["experiment"]["total_frames"]:
             return ""
         return sweep_record.achieved(summary)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, OmegaConfBaseException, YAMLError):
         return ""
-
-
-def _differ(wanted: Mapping[str, Any], held: Mapping[str, Any], prefix: str = "") -> bool:
-    """Whether a key that both have has two values."""
-    for key in wanted.keys() & held.keys():
-        name, ours, theirs = f"{prefix}{key}", wanted[key], held[key]
-        if name in NOT_COMPARED:
-            continue
-        if isinstance(ours, Mapping) and isinstance(theirs, Mapping):
-            if _differ(ours, theirs, f"{name}."):
-                return True
-        elif ours != theirs:
-            return True
-    return False
 
 
 def _do(values: dict[str, Any], overrides: list[str], cwd: Path) -> dict[str, str]:
@@ -193,8 +181,10 @@ def main() -> int:
 def _train(values: Mapping[str, Any], overrides: list[str]) -> dict[str, str]:
     try:
         config = typed(OmegaConf.create(dict(values)))
-        validate(config)
-        from softgm_bench.runs.loop import train  # late: a refused job need not wait for it
+        from softgm_bench.assembly import check  # late, as all that brings torch along
+
+        check(config)
+        from softgm_bench.runs.loop import train
 
         run_dir = Path(config.run_dir)
         with sweep_record.running(run_dir), _logged(run_dir / LOG):

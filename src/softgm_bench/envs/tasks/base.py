@@ -86,6 +86,8 @@ class TaskConfig:
     sensing_radius: float
     bin_length: float
     slots: int
+    train_horizon: int | None
+    hidden_scene: bool
     actuation: ActuationConfig
     reward: RewardConfig
     curriculum: CurriculumConfig
@@ -99,6 +101,8 @@ class TaskConfig:
         for name, lowest in (("n_agents", 1), ("horizon", 1), ("slots", 0)):
             if getattr(self, name) < lowest:
                 raise ValueError(f"task.{name} is {getattr(self, name)}: it must be at least {lowest}")
+        if self.train_horizon is not None and self.train_horizon < 1:
+            raise ValueError(f"task.train_horizon is {self.train_horizon}: it must be at least 1, or null")
         for name in ("success_radius", "sensing_radius", "bin_length"):
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"task.{name} is {getattr(self, name)}: it must be above 0")

@@ -1,0 +1,78 @@
+"""What settings of the right types must satisfy, as far as it shows without building anything."""
+
+import os
+import re
+
+from softgm_bench.config.schema import DTYPES, OBSERVATIONS, Config
+from softgm_bench.errors import UserError
+
+
+def validate(config: Config) -> None:
+    """Refuse settings that have the right types and make no sense; ``assembly.check_by_building`` finds the rest.
+
+    Raises:
+        UserError: naming the first such key, its value and what would be right.
+    """
+    experiment, evaluation, checkpoint = config.experiment, config.experiment.evaluation, config.experiment.checkpoint
+    if not 0 <= config.seed < 2**63:
+        raise UserError(f"seed={config.seed}: a seed is a whole number from 0 to 2**63 - 1")
+    at_least_one = {
+        "experiment.total_frames": experiment.total_frames,
+        "experiment.num_envs": experiment.num_envs,
+        "experiment.steps_per_batch": experiment.steps_per_batch,
+        "experiment.train_horizon": experiment.train_horizon,
+        "experiment.evaluation.interval": evaluation.interval,
+        "experiment.evaluation.episodes": evaluation.episodes,
+        "experiment.evaluation.final_episodes": evaluation.final_episodes,
+        "experiment.evaluation.horizon": evaluation.horizon,
+        "experiment.evaluation.final_horizon": evaluation.final_horizon,
+        "experiment.checkpoint.interval": checkpoint.interval,
+        "experiment.checkpoint.keep": checkpoint.keep,
+    }
+    for key, value in at_least_one.items():
+        if value is not None and value < 1:
+            raise UserError(f"{key}={value}: it must be at least 1")
+    if not config.run_dir:
+        raise UserError("run_dir is empty: name a folder for the run")
+    if config.observation not in OBSERVATIONS:
+        raise UserError(f"observation={config.observation}: choose one of {', '.join(OBSERVATIONS)}")
+    if config.oracle and "oracle" not in config.run_dir:
+        raise UserError(f"run_dir={config.run_dir} with observation=oracle: put the word oracle into the folder's name")
+    _validate_machine(config)
+
+
+def available_threads() -> int:
+    """Number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _validate_machine(config: Config) -> None:
+    from softgm_bench.rod.backend import BACKENDS
+
+    cores = available_threads()
+    if config.threads is not None and not 1 <= config.threads <= cores:
+        raise UserError(f"threads={config.threads}: choose 1 to {cores}, the cores of this machine, or null")
+    if config.backend is not None and config.backend not in BACKENDS:
+        raise UserError(f"backend={config.backend}: choose one of {', '.join(BACKENDS)}, or null")
+    if config.dtype not in DTYPES:
+        raise UserError(f"dtype={config.dtype}: choose one of {', '.join(DTYPES)}")
+    if config.device == "cpu" and config.backend == "cuda":
+        raise UserError("backend=cuda runs on a CUDA device: add device=cuda, or choose backend=numba")
+    if config.device != "cpu" and config.backend == "numba":
+        raise UserError(f"device={config.device}: backend=numba runs on the CPU; choose backend=cuda, torch or null")
+    validate_device(config.device)
+
+
+def validate_device(device: str) -> None:
+    """Refuse a device that there is not.
+
+    Raises:
+        UserError: saying what there is.
+    """
+    import torch
+
+    cuda = re.fullmatch(r"cpu|cuda(?::(\d+))?", device)
+    if cuda is None:
+        raise UserError(f"device={device}: choose cpu, cuda or cuda:<index>")
+    if device != "cpu" and int(cuda.group(1) or 0) >= torch.cuda.device_count():
+        raise UserError(f"device={device}: this machine has {torch.cuda.device_count()} CUDA devices")

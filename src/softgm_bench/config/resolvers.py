@@ -1,0 +1,45 @@
+"""How a value in ``conf/`` depends on what was chosen elsewhere: the functions that its YAML may call.
+
+``gamma: ${tuned_or_paper:0.95, 0.99}`` has both recipes' values in the line that they belong to, so no file overrides
+another's and nothing depends on the order of files. A value on the command line, or in a recipe of a user's own,
+replaces the whole line.
+"""
+
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from softgm_bench.config.schema import PAPER, labelled
+
+SMOKE = "smoke"
+
+
+def tuned_or_paper(tuned: Any, paper: Any, *, _root_: DictConfig) -> Any:
+    """The first value with ``recipe=tuned``, the second with ``recipe=paper``."""
+    return paper if OmegaConf.select(_root_, "recipe") == PAPER else tuned
+
+
+def on_or_off_policy(on: Any, off: Any, *, _root_: DictConfig) -> Any:
+    """The second value for algorithms that learn from a replay (``algo.replay_capacity``), the first for the others."""
+    return on if OmegaConf.select(_root_, "algo.replay_capacity") is None else off
+
+
+def in_smoke(smoke: Any, otherwise: Any, *, _root_: DictConfig) -> Any:
+    """The first value with ``experiment=smoke``, the second with every other experiment."""
+    return smoke if OmegaConf.select(_root_, "experiment.name") == SMOKE else otherwise
+
+
+def first(*values: Any) -> Any:
+    """The first value that is not null; null if all are."""
+    return next((value for value in values if value is not None), None)
+
+
+def label(*, _root_: DictConfig) -> str:
+    """What results are named after, ``Config.label``; for run folders."""
+    return labelled(_root_.algo.name, _root_.model.name, _root_.observation, _root_.perturbation.name)
+
+
+def register() -> None:
+    """Let YAML call the functions above by their names."""
+    for resolver in (tuned_or_paper, on_or_off_policy, in_smoke, first, label):
+        OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)

@@ -1,0 +1,122 @@
+"""The types of a run's settings, what results are named after, and which dataclass a chosen name stands for."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from softgm_bench import plugins
+from softgm_bench.config.loggers import LoggerConfig
+from softgm_bench.rod.parameters import RodParameters
+
+DTYPES = ("float64", "float32")
+OBSERVATIONS = ("standard", "oracle")
+TUNED, PAPER = "tuned", "paper"
+RECIPES = (TUNED, PAPER)
+
+
+@dataclass
+class EvaluationConfig:
+    """When and how the policy is evaluated; see ``conf/experiment/default.yaml``."""
+
+    interval: int
+    episodes: int
+    final_episodes: int
+    deterministic: bool
+    horizon: int | None
+    final_horizon: int | None
+
+
+@dataclass
+class CheckpointConfig:
+    """When checkpoints are written; see ``conf/experiment/default.yaml``."""
+
+    interval: int
+    keep: int
+
+
+@dataclass
+class ExperimentConfig:
+    """How long to train and how often to look; see ``conf/experiment/default.yaml``."""
+
+    name: str
+    total_frames: int
+    num_envs: int
+    steps_per_batch: int
+    train_horizon: int | None
+    evaluation: EvaluationConfig
+    checkpoint: CheckpointConfig
+
+
+@dataclass
+class Config:
+    """Everything that a run depends on; see ``conf/config.yaml``.
+
+    ``task``, ``algo`` and ``model`` are instances of the dataclass that the key ``name`` in their YAML stands for.
+    ``recipe`` is one of ``RECIPES``, also under a recipe of a user's own, which builds on one of them; it is empty for
+    runs from before it was written down.
+    """
+
+    recipe: str
+    seed: int
+    observation: str
+    device: str
+    backend: str | None
+    dtype: str
+    threads: int | None
+    run_dir: str
+    overwrite: bool
+    resume: bool
+    task: Any
+    algo: Any
+    model: Any
+    rod: RodParameters
+    experiment: ExperimentConfig
+    perturbation: Any  # a PerturbationConfig, which brings torch along
+    logger: LoggerConfig
+
+    @property
+    def oracle(self) -> bool:
+        """Whether actors are told what they would have to discover: an upper bound, not a competitor."""
+        return self.observation == "oracle"
+
+    @property
+    def label(self) -> str:
+        """The algorithm's name as results carry it."""
+        return labelled(self.algo.name, model_name(self.model), self.observation, self.perturbation.name)
+
+
+def labelled(algo: str, model: str, observation: str, perturbation: str) -> str:
+    """``algo``, and whatever in model, observation and perturbation makes its results another kind's.
+
+    SoftGM has the model that it is named after, the other algorithms an MLP; any other is named. A model whose name
+    begins with the algorithm's, such as an ablation's, names both.
+    """
+    own = "softgm" if algo.startswith("softgm") else "mlp"
+    if model.startswith(f"{algo}_"):
+        algo, own = model, model
+    usual = {own: model, "standard": observation, "none": perturbation}
+    return "_".join([algo, *(value for default, value in usual.items() if value != default)])
+
+
+def dtype_of(config: Config) -> Any:
+    """The ``torch.dtype`` of the rod's state; torch is imported late because that takes seconds."""
+    import torch
+
+    return getattr(torch, config.dtype)
+
+
+def group_schemas() -> dict[str, dict[str, type]]:
+    """Dataclass of every task, algorithm and model by name; imported late because it brings torch along."""
+    from softgm_bench.algorithms import algorithm_configs
+    from softgm_bench.envs import task_configs
+    from softgm_bench.models.registry import model_configs
+
+    plugins.load()
+    return {"task": task_configs(), "algo": algorithm_configs(), "model": model_configs()}
+
+
+def model_name(model: Any) -> str:
+    """A model's name: where several share a dataclass its settings say it, otherwise their type does."""
+    if hasattr(model, "name"):
+        return model.name
+    (name,) = (name for name, schema in group_schemas()["model"].items() if schema is type(model))
+    return name

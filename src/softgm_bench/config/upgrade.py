@@ -1,0 +1,24 @@
+"""Settings that earlier versions wrote down, in today's words: run folders, checkpoints and files of policies."""
+
+from collections.abc import Mapping
+from typing import Any
+
+# Keys that earlier versions did not have, with the values that leave everything as it was. An unknown recipe or
+# experiment has no name; the training horizon of such a run stands in its experiment.
+NEUTRAL: dict[str, Any] = {
+    "recipe": "",
+    "resume": False,
+    "experiment.name": "",
+    "task.train_horizon": None,
+    "task.hidden_scene": False,
+}
+ABLATIONS = ("softgm_no_stage1", "softgm_no_stage2")  # algorithms then, models of the algorithm softgm now
+
+
+def upgraded(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Plain values of a configuration with today's names; those of today come back as they are."""
+    algo = values.get("algo")
+    if not isinstance(algo, Mapping) or algo.get("name") not in ABLATIONS:
+        return dict(values)
+    model = dict(values.get("model") or {}) | {"name": algo["name"]}
+    return dict(values) | {"algo": dict(algo) | {"name": "softgm"}, "model": model}
