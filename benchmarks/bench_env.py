@@ -45,7 +45,7 @@ def measure(task: str, dtype: str, num_envs: int, device: str, repetitions: int)
         config.task, config.rod, num_envs, seed=0, horizon=HORIZON, device=device, dtype=DTYPES[dtype], stagger=True
     )
     generator = torch.Generator(device).manual_seed(0)
-    shape = (HORIZON, num_envs, env.n_agents, 2)
+    shape = (HORIZON, num_envs, env.sizes.n_agents, 2)
     actions = 2.0 * torch.rand(shape, generator=generator, device=device) - 1.0
     stopwatch = watched(env)
     td = env.reset()

@@ -24,6 +24,7 @@ from observations import observation
 
 from softgm_bench.config import compose
 from softgm_bench.envs import entries
+from softgm_bench.envs.interface import Sizes
 from softgm_bench.models import build_encoder, graph
 from softgm_bench.models.softgm import SoftGMConfig
 from softgm_bench.runs.machine import keep_memory, set_threads
@@ -96,8 +97,8 @@ def main() -> None:
 
     config = compose(["algo=softgm"]).model
     encoders = {
-        "softgm": build_encoder(config, N_AGENTS, N_SLOTS),
-        "mlp": build_encoder(compose(["model=mlp"]).model, N_AGENTS, N_SLOTS),
+        "softgm": build_encoder(config, Sizes(N_AGENTS, 2, n_slots=N_SLOTS)),
+        "mlp": build_encoder(compose(["model=mlp"]).model, Sizes(N_AGENTS, 2, n_slots=N_SLOTS)),
         "torch_geometric": Geometric(config),
     }
     rows = []

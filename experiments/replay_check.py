@@ -20,11 +20,11 @@ import torch
 from torchrl.envs import EnvBase
 
 from softgm_bench.assembly import build_env
-from softgm_bench.episodes import policy, trajectory
+from softgm_bench.episodes import policy, recording, trajectory
 from softgm_bench.episodes.evaluation import evaluate_in_parts
 from softgm_bench.episodes.replay import compare, replay
-from softgm_bench.storage.versions import versions
 from softgm_bench.storage.files import to_json
+from softgm_bench.storage.versions import versions
 
 ROOT = Path(__file__).parents[1]
 
@@ -44,7 +44,7 @@ def main() -> None:
     trained = policy.load(options.policy)
     rows = []
     for episode, horizon in chosen(trained, options):
-        one = trajectory.record(trained, options.seed, episode, horizon, episodes=options.episodes)
+        one = recording.record(trained, options.seed, episode, horizon, episodes=options.episodes)
         rows.append(check(one))
         print(line(rows[-1]), flush=True)
     out = ROOT / "experiments" / "replays" / f"{options.policy.stem}.json"
@@ -70,11 +70,11 @@ def chosen(trained: policy.TrainedPolicy, options: argparse.Namespace) -> list[t
         deterministic=True,
         seed=options.seed,
     )
-    assert records.success is not None
-    assert records.contact_steps is not None
-    succeeded = np.flatnonzero(records.success & (records.length <= options.longest))[: options.successes]
-    failed = np.flatnonzero(~records.success)
-    failed = failed[np.argsort(-records.contact_steps[failed], kind="stable")][: options.failures]
+    assert records["success"] is not None
+    assert records["contact_steps"] is not None
+    succeeded = np.flatnonzero(records["success"] & (records["length"] <= options.longest))[: options.successes]
+    failed = np.flatnonzero(~records["success"])
+    failed = failed[np.argsort(-records["contact_steps"][failed], kind="stable")][: options.failures]
     horizon = trained.config.task.horizon
     return [(int(episode), horizon) for episode in succeeded] + [(int(episode), options.steps) for episode in failed]
 

@@ -83,7 +83,7 @@ def test_an_evaluation_is_that_of_the_command(run, tmp_path):
     summaries = [json.loads((tmp_path / name / "summary.json").read_text()) for name in ("api", "command")]
     assert episodes[0] == episodes[1]
     assert summaries[0] == summaries[1]
-    assert result.metrics["success_rate"]["mean"] == result.records.success.mean()
+    assert result.metrics["success_rate"]["mean"] == result.records["success"].mean()
     assert "success rate" in str(result)
 
 
@@ -92,8 +92,8 @@ def test_a_recorded_episode_is_one_of_the_evaluation(run):
     episode = api.record(trained, seed=2, horizon=3)
     records = api.evaluate(trained, episodes=1, seed=2, horizon=3).records
 
-    assert episode.steps == records.length[0]
-    assert episode.reward.sum() == pytest.approx(records.undiscounted_return[0], rel=1e-6)
+    assert episode.steps == records["length"][0]
+    assert episode.reward.sum() == pytest.approx(records["undiscounted_return"][0], rel=1e-6)
 
 
 def test_an_algorithm_can_be_trained_in_a_loop_of_ones_own():

@@ -12,7 +12,7 @@ sys.path.insert(0, str(Path(__file__).parent / "episodes"))
 from recorded import SEEN, untrained, watched
 
 from softgm_bench import attention
-from softgm_bench.episodes import policy, trajectory
+from softgm_bench.episodes import policy, recording, trajectory
 
 
 @pytest.fixture
@@ -40,7 +40,7 @@ def test_a_policys_episode_gives_arrays_and_pictures(run, tmp_path):
     assert files[0].parent == Path("outputs/attention/kept/wall_seed0_episode1of2")
     for file in files[1:]:
         assert file.read_bytes().startswith(b"\x89PNG")
-    one = trajectory.record(untrained(*SEEN), 0, 1, 5, attention=True)
+    one = recording.record(untrained(*SEEN), 0, 1, 5, attention=True)
     with np.load(files[0]) as arrays:
         assert np.allclose(arrays["stage1"], one.attention["stage1"], atol=1e-6)
         assert np.allclose(arrays["stage2"], one.attention["stage2"], atol=1e-6)

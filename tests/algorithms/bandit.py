@@ -10,10 +10,11 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from softgm_bench.envs import entries
+from softgm_bench.envs.interface import Sizes
 
 NUM_ENVS, N_AGENTS, N_SLOTS = 32, 2, 2
-SIZES = SimpleNamespace(
-    n_agents=N_AGENTS, n_slots=N_SLOTS, n_privileged=0, batch_size=torch.Size([NUM_ENVS]), device=torch.device("cpu")
+ENV = SimpleNamespace(
+    sizes=Sizes(N_AGENTS, 2, n_slots=N_SLOTS), batch_size=torch.Size([NUM_ENVS]), device=torch.device("cpu")
 )
 
 # 32 random iterations of 32 frames, then 8 gradient steps an iteration.
@@ -31,7 +32,7 @@ LEARNS_FAST = {
 def observation():
     """Random targets, all else at rest, ``(NUM_ENVS,)``."""
     lead = (NUM_ENVS,)
-    entries = {
+    values = {
         entries.AGENT_POSITION: torch.zeros(*lead, N_AGENTS, 3),
         entries.AGENT_VELOCITY: torch.zeros(*lead, N_AGENTS, 3),
         entries.PREVIOUS_ACTION: torch.zeros(*lead, N_AGENTS, 2),
@@ -42,7 +43,7 @@ def observation():
         entries.TARGET: torch.rand(*lead, 3) * 1.4 - 0.7,
     }
     td = TensorDict({}, lead)
-    for key, value in entries.items():
+    for key, value in values.items():
         td[key] = value
     return td
 

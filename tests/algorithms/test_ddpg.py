@@ -2,7 +2,7 @@ import dataclasses
 
 import pytest
 import torch
-from bandit import LEARNS_FAST, SIZES, error_after_learning
+from bandit import ENV, LEARNS_FAST, error_after_learning
 from off_policy_cases import SHORT, SMALL, batches, filled, says, three_ends
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -174,7 +174,7 @@ def test_without_the_replay_an_algorithm_waits_for_new_frames(build):
 def test_it_learns_what_each_agent_should_do(settings, name):
     config = dataclasses.replace(settings(f"algo={name}").algo, **LEARNS_FAST, initial_sigma=0.5, final_sigma=0.5)
     torch.manual_seed(0)
-    algorithm = DDPG(config, MLPConfig(hidden=32, layers=2, velocity_scale=1.0), SIZES)
+    algorithm = DDPG(config, MLPConfig(hidden=32, layers=2, velocity_scale=1.0), ENV)
     assert error_after_learning(algorithm, 32 + 60) < 0.02
 
 

@@ -249,7 +249,7 @@ def test_an_oracle_is_told_and_learns_from_it(build, name):
 
 def test_a_task_without_secrets_has_no_privileged_entry_to_read(build):
     algorithm, env = build("basic", "algo.critic.asymmetric=true", oracle=True)
-    assert env.n_privileged == 0
+    assert env.sizes.n_privileged == 0
     algorithm.update(collect(algorithm, env))
 
 

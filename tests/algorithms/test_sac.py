@@ -3,7 +3,7 @@ import math
 
 import pytest
 import torch
-from bandit import LEARNS_FAST, SIZES, error_after_learning
+from bandit import ENV, LEARNS_FAST, error_after_learning
 from off_policy_cases import SHORT, SMALL, batches, filled, says, three_ends
 from test_ddpg import actions, observe
 from torchrl.envs.utils import ExplorationType
@@ -184,5 +184,5 @@ def test_an_update_moves_actor_critics_targets_and_temperature_on_every_model(bu
 def test_it_learns_what_each_agent_should_do(settings, name):
     config = dataclasses.replace(settings(f"algo={name}").algo, **LEARNS_FAST, alpha_lr=3e-3, initial_alpha=0.05)
     torch.manual_seed(0)
-    algorithm = SAC(config, MLPConfig(hidden=32, layers=2, velocity_scale=1.0), SIZES)
+    algorithm = SAC(config, MLPConfig(hidden=32, layers=2, velocity_scale=1.0), ENV)
     assert error_after_learning(algorithm, 32 + 40) < 0.02

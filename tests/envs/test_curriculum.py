@@ -9,11 +9,11 @@ from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
+from dense import force_dense
 from softgm_bench.config import UserError, compose
 from softgm_bench.envs.curriculum import difficulty, first_progress, note_ends
 from softgm_bench.envs.tasks import make_task
 from softgm_bench.envs.tasks.base import CurriculumConfig, eased
-from softgm_bench.rod.dense import force_dense
 
 TASKS = ("basic", "structured", "wall", "wall_narrow", "wall_fixed")
 ENABLED = "task.curriculum.enabled=true"

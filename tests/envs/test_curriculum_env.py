@@ -4,9 +4,9 @@ import pytest
 import torch
 from torchrl.envs.utils import check_env_specs
 
+from dense import force_dense
 from round_trips import RoundTrips
 from softgm_bench.envs import entries, make_env
-from softgm_bench.rod.dense import force_dense
 from softgm_bench.rod.parameters import RodParameters
 
 TASKS = ("basic", "structured", "wall")
@@ -26,7 +26,7 @@ def build(settings):
 
 def actions(env, steps):
     generator = torch.Generator().manual_seed(1)
-    return 2.0 * torch.rand((steps, *env.batch_size, env.n_agents, 2), generator=generator) - 1.0
+    return 2.0 * torch.rand((steps, *env.batch_size, env.sizes.n_agents, 2), generator=generator) - 1.0
 
 
 def leaves(td):
@@ -41,14 +41,16 @@ def edit(env, change):
 
 def put_targets_at_the_tips(env, rows):
     def aim(state):
-        state["scene", "target"][rows] = state["rod", "position"][rows, :, -1]
+        state["episodes", "scene", "target"][rows] = state["episodes", "rod", "position"][rows, :, -1]
 
     edit(env, aim)
 
 
 def advance(env, td, action=None):
     """The frames after a step and after the resets that follow it."""
-    td = td.clone().set(entries.ACTION, torch.zeros(*env.batch_size, env.n_agents, 2) if action is None else action)
+    td = td.clone().set(
+        entries.ACTION, torch.zeros(*env.batch_size, env.sizes.n_agents, 2) if action is None else action
+    )
     out, following = env.step_and_maybe_reset(td)
     return out["next"], following
 
@@ -138,7 +140,7 @@ def test_broken_episodes_are_failures(build):
     edit(env, lambda state: state["curriculum", "stage"].fill_(2))
     td = env.reset()
     put_targets_at_the_tips(env, [0, 1, 2, 3])
-    edit(env, lambda state: state["rod", "velocity"].fill_(float("nan")))
+    edit(env, lambda state: state["episodes", "rod", "velocity"].fill_(float("nan")))
     after, td = advance(env, td)
     assert after[entries.DIVERGED].all()
     assert torch.equal(td[entries.DIFFICULTY], torch.full((4, 1), 0.25))
@@ -149,7 +151,7 @@ def test_an_episode_that_has_ended_and_is_not_reset_counts_once(build):
     td = env.reset().set(entries.ACTION, torch.zeros(2, 6, 2))
     for _ in range(3):
         td = env.step(td.clone().exclude("next"))["next"].exclude("reward").set(entries.ACTION, torch.zeros(2, 6, 2))
-        assert env.simulation_state()["curriculum", "counted"].tolist() == [1, 1]
+        assert env.simulation_state()["progress", "counted"].tolist() == [1, 1]
 
 
 def test_first_episodes_that_are_cut_short_count_for_nothing(build):
@@ -157,7 +159,7 @@ def test_first_episodes_that_are_cut_short_count_for_nothing(build):
     td = env.reset()
     for _ in range(6):
         _, td = advance(env, td)
-    state = env.simulation_state()["curriculum"]
+    state = env.simulation_state()["progress"]
     assert state["counting"].all()  # every first episode has ended
     assert not state["counted"].any()
 

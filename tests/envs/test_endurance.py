@@ -20,13 +20,13 @@ def test_full_torque_that_keeps_changing_sign_against_the_wall_breaks_nothing(se
             action = torch.where(torch.rand(64, 6, 2, generator=generator) < leaning, 1.0, -1.0)
         # what has reached its target by chance goes on as well
         state = env.simulation_state()
-        state["terminated"].zero_()
+        state["episodes", "terminated"].zero_()
         env.load_simulation_state(state)
         td = env.step(td.exclude("reward").clone().set(entries.ACTION, action))["next"]
         diverged |= td[entries.DIVERGED]
         touched += td[entries.CONTACT_NODES].mean().item()
     assert not diverged.any()
     assert touched > 100.0
-    director = env.simulation_state()["rod", "director"]
+    director = env.simulation_state()["episodes", "rod", "director"]
     gram = torch.einsum("bijn,bkjn->bnik", director, director)
     assert (gram - torch.eye(3, dtype=torch.float64)).abs().max() < 1e-9

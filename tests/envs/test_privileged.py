@@ -25,11 +25,11 @@ def build(settings):
 def test_a_wall_tells_its_openings_centre_and_side(build, settings, task):
     env, side = build(task, num_envs=64), settings(f"task={task}").task.opening_side
     privileged = env.reset()[entries.PRIVILEGED]
-    assert privileged.shape == (64, env.n_privileged) == (64, 4)
+    assert privileged.shape == (64, env.sizes.n_privileged) == (64, 4)
     assert privileged.dtype == torch.float32
     assert torch.allclose(privileged[:, 0], torch.tensor(0.4))
     assert torch.allclose(privileged[:, 3], torch.tensor(side))
-    cylinders = env.simulation_state()["scene", "cylinders"]
+    cylinders = env.simulation_state()["episodes", "scene", "cylinders"]
     for row in range(64):
         start = cylinders["start"][row][cylinders["mask"][row]]
         length = cylinders["length"][row][cylinders["mask"][row]]
@@ -52,7 +52,7 @@ def test_it_stays_through_an_episode_and_changes_with_the_next(build):
 @pytest.mark.parametrize("task", ["basic", "structured"])
 def test_where_there_is_nothing_to_tell_the_entry_is_absent(build, task):
     env = build(task)
-    assert env.n_privileged == 0
+    assert env.sizes.n_privileged == 0
     assert entries.PRIVILEGED not in set(env.reset().keys())
     assert entries.PRIVILEGED not in set(env.observation_spec.keys())
     check_env_specs(env)
@@ -75,7 +75,7 @@ def test_the_collector_hands_it_on_for_now_and_next(build):
 @pytest.mark.parametrize("model", ["softgm", "mlp"])
 def test_it_reaches_no_actor(build, settings, model):
     env, config = build("wall"), settings("task=wall", "algo=softgm", f"model={model}")
-    policy = build_actor(config.model, env.n_agents, env.n_slots, config.algo.actor)
+    policy = build_actor(config.model, env.sizes, config.algo.actor)
     td = env.reset()
     assert entries.PRIVILEGED not in entries.OBSERVATION
     with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():

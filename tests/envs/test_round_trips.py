@@ -4,9 +4,9 @@ import pytest
 import torch
 from torchrl.envs import EnvBase
 
+from dense import force_dense
 from round_trips import RoundTrips
 from softgm_bench.envs import SoftArmEnv, entries, make_env
-from softgm_bench.rod.dense import force_dense
 from softgm_bench.rod.parameters import RodParameters
 
 TASKS = ("basic", "structured", "wall")
@@ -33,7 +33,7 @@ def build(settings):
 
 def actions(env, steps):
     generator = torch.Generator().manual_seed(1)
-    return 2.0 * torch.rand((steps, *env.batch_size, env.n_agents, 2), generator=generator) - 1.0
+    return 2.0 * torch.rand((steps, *env.batch_size, env.sizes.n_agents, 2), generator=generator) - 1.0
 
 
 def leaves(td):
@@ -43,7 +43,7 @@ def leaves(td):
 @pytest.mark.parametrize("task", TASKS)
 def test_neither_steps_nor_resets_wait_for_a_device(build, task):
     env = build(task, horizon=3, stagger=True)
-    env.backend = Standing(env.backend.parameters)
+    env.simulator.backend = Standing(env.backend.parameters)
     td = env.reset()
     with force_dense():
         env.step_and_maybe_reset(td.clone().set(entries.ACTION, actions(env, 1)[0]))  # constants are copied once
@@ -65,15 +65,16 @@ def test_the_same_watch_finds_the_cpus_shortcuts(build):
 def test_a_step_can_be_taken_where_tensors_have_no_values_and_no_cpu_tensor_joins_in(build, task):
     """On the meta device a look at any value raises, and so does an operation between two devices."""
     env = build(task)
-    env.backend = Standing(env.backend.parameters)
+    env.simulator.backend = Standing(env.backend.parameters)
     td = env.reset().set(entries.ACTION, actions(env, 1)[0])
     expected = leaves(env._step(td))
     vars(env)["_device"] = torch.device("meta")  # env.to() would look at the bounds in the specs
-    for name, value in vars(env).items():
+    vars(env.simulator)["device"] = torch.device("meta")
+    for name, value in vars(env.simulator).items():
         if isinstance(value, torch.Tensor):
-            setattr(env, name, value.to("meta"))
-    env._simulation = env._simulation.to("meta")
-    env._actuation.matrix = env._actuation.matrix.to("meta")
+            setattr(env.simulator, name, value.to("meta"))
+    env.simulator.state = env.simulator.state.to("meta")
+    env.simulator._actuation.matrix = env.simulator._actuation.matrix.to("meta")
     found = leaves(env._step(td.to("meta")))
     assert found.keys() == expected.keys()
     for key, value in found.items():
@@ -92,7 +93,7 @@ def test_both_ways_make_the_same_episodes_bit_by_bit(build, task, dtype):
         for step, action in enumerate(push):
             if step == 20:  # one of them breaks
                 state = env.simulation_state()
-                state["rod", "velocity"][2, 0, 5] = float("nan")
+                state["episodes", "rod", "velocity"][2, 0, 5] = float("nan")
                 env.load_simulation_state(state)
             td = env.step(td.exclude("next", "reward").set(entries.ACTION, action))["next"]
             frames.append(leaves(td))

@@ -26,7 +26,7 @@ def act(env, td, action):
 
 def random_actions(env, steps, seed=0):
     generator = torch.Generator().manual_seed(seed)
-    shape = (steps, *env.batch_size, env.n_agents, 2)
+    shape = (steps, *env.batch_size, env.sizes.n_agents, 2)
     return 2.0 * torch.rand(shape, generator=generator) - 1.0
 
 
@@ -96,7 +96,7 @@ def test_success_terminates_pays_and_is_not_a_truncation(build):
     td = env.reset()
 
     def aim(state):
-        state["scene", "target"][1] = torch.tensor([0.0, 0.01, 0.99])
+        state["episodes", "scene", "target"][1] = torch.tensor([0.0, 0.01, 0.99])
 
     edit(env, aim)
     td = act(env, td, torch.zeros(4, 6, 2))
@@ -115,11 +115,11 @@ def test_an_environment_that_is_done_stands_still_until_it_is_reset(build):
     state = env.simulation_state()
     act(env, td, torch.ones(4, 6, 2))
     after = env.simulation_state()
-    assert torch.equal(state["rod", "position"], after["rod", "position"])
-    assert torch.equal(state["steps"], after["steps"])
+    assert torch.equal(state["episodes", "rod", "position"], after["rod", "position"])
+    assert torch.equal(state["episodes", "steps"], after["steps"])
     td = env.reset(td.set("_reset", torch.tensor([[True], [False], [True], [False]])))
     assert td["done"].squeeze(-1).tolist() == [False, True, False, True]
-    assert env.simulation_state()["steps"].tolist() == [0, 2, 0, 2]
+    assert env.simulation_state()["episodes", "steps"].tolist() == [0, 2, 0, 2]
 
 
 @pytest.mark.parametrize("task", ["basic", "wall"])
@@ -218,7 +218,7 @@ def test_moving_an_undiscovered_obstacle_changes_no_bit_of_any_action(build, set
     config = settings("task=wall", "algo=softgm")
     env = build("wall", rod=rod)
     torch.manual_seed(0)
-    policy = build_actor(config.model, env.n_agents, env.n_slots, config.algo.actor)
+    policy = build_actor(config.model, env.sizes, config.algo.actor)
     td = env.reset()
     push = torch.zeros(4, 6, 2)
     push[..., 0] = 0.9  # towards the wall
@@ -236,16 +236,18 @@ def test_moving_an_undiscovered_obstacle_changes_no_bit_of_any_action(build, set
             return policy(out.select(*entries.OBSERVATION))
 
     unchanged = observe(lambda state: state)
-    known = env.simulation_state()["table", "known"]  # after the step: what it may still discover stays in place
+    known = env.simulation_state()[
+        "episodes", "table", "known"
+    ]  # after the step: what it may still discover stays in place
 
     def move_unknown(state):
-        state["bins", "descriptor"][state["bins", "mask"] & ~known] += 50.0
+        state["episodes", "bins", "descriptor"][state["episodes", "bins", "mask"] & ~known] += 50.0
         touched = known.unflatten(1, (env.task.max_cylinders, -1)).any(dim=-1)
-        state["scene", "cylinders", "start"][~touched] += 50.0
+        state["episodes", "scene", "cylinders", "start"][~touched] += 50.0
         return state
 
     def move_known(state):
-        state["bins", "descriptor"][state["table", "known"]] += 0.01
+        state["episodes", "bins", "descriptor"][state["episodes", "table", "known"]] += 0.01
         return state
 
     moved, seen = observe(move_unknown), observe(move_known)

@@ -4,9 +4,9 @@ import math
 import pytest
 import torch
 
+from dense import force_dense
 from softgm_bench.envs.tasks import make_task
 from softgm_bench.envs.tasks.base import first_accepted
-from softgm_bench.rod.dense import force_dense
 
 COUNT = 500
 

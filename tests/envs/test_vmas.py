@@ -25,7 +25,7 @@ def theirs(config, seed):
 
 def random_actions(env, steps):
     generator = torch.Generator().manual_seed(1)
-    shape = (steps, ENVS, env.n_agents, 2)
+    shape = (steps, ENVS, env.sizes.n_agents, 2)
     return torch.empty(shape).uniform_(-1.0, 1.0, generator=generator)
 
 
@@ -95,7 +95,7 @@ def test_the_horizon_ends_an_episode(limit_terminates):
     config = VmasConfig("vmas_navigation", 100, limit_terminates, ARGUMENTS["vmas_navigation"])
     env = VmasEnv(config, ENVS, seed=0)
     data = env.reset()
-    rest = torch.zeros(ENVS, env.n_agents, 2)
+    rest = torch.zeros(ENVS, env.sizes.n_agents, 2)
     for count in range(1, 102):
         now, data = step(env, data, rest)
         done, terminated, truncated = (

@@ -9,7 +9,7 @@ from softgm_bench.algorithms import build_algorithm
 from softgm_bench.assembly import build_env
 from softgm_bench.config import compose
 from softgm_bench.envs import entries
-from softgm_bench.episodes import policy, trajectory
+from softgm_bench.episodes import policy, recording, trajectory
 
 WALL = ("task=wall", "task.wall_x=0.2")  # near enough to be touched by the arm's middle soon
 SEEN = ("task=wall", "task.sensing_radius=0.4")  # near enough to be sensed before the arm moves
@@ -45,10 +45,10 @@ def untrained(*overrides: str) -> policy.TrainedPolicy:
 @cache
 def recorded(*overrides: str, horizon: int = 30) -> trajectory.Trajectory:
     """Episode 1 of two, of the policy that leans; it touches ``WALL`` within 20 steps."""
-    return trajectory.record(leaning(*overrides), seed=0, episode=1, horizon=horizon)
+    return recording.record(leaning(*overrides), seed=0, episode=1, horizon=horizon)
 
 
 @cache
 def watched(*overrides: str, horizon: int = 30) -> trajectory.Trajectory:
     """The same of an untrained policy, which hardly moves, with attention if it has any."""
-    return trajectory.record(untrained(*overrides), seed=0, episode=1, horizon=horizon, attention=True)
+    return recording.record(untrained(*overrides), seed=0, episode=1, horizon=horizon, attention=True)

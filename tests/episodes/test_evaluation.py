@@ -5,10 +5,10 @@ from counting_env import N_AGENTS, CountingEnv
 from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import exploration_type
 
+from dense import force_dense
 from softgm_bench.envs import entries, make_env
 from softgm_bench.episodes.evaluation import evaluate, evaluate_in_parts, evaluation_seed
 from softgm_bench.episodes.summary import summarise, wilson_interval
-from softgm_bench.rod.dense import force_dense
 from softgm_bench.rod.parameters import RodParameters
 from softgm_bench.runs.loop import derive_seeds
 
@@ -25,13 +25,13 @@ def policy(seen=None):
 def test_every_environment_counts_its_first_episode_and_no_more():
     records = evaluate(policy(), CountingEnv([3, 1, 7]), deterministic=True, seed=0, gamma=0.5)
 
-    np.testing.assert_array_equal(records.length, [3, 1, 7])
-    np.testing.assert_allclose(records.undiscounted_return, [3, 1, 7])
-    np.testing.assert_allclose(records.discounted_return, [1.75, 1.0, 2 - 0.5**6])
-    np.testing.assert_allclose(records.tip_travel_distance, [1.5, 0.5, 3.5])
-    np.testing.assert_allclose(records.final_distance, [3, 1, 7])
-    np.testing.assert_array_equal(records.success, [True, False, True])
-    np.testing.assert_array_equal(records.diverged, [False, True, False])
+    np.testing.assert_array_equal(records["length"], [3, 1, 7])
+    np.testing.assert_allclose(records["undiscounted_return"], [3, 1, 7])
+    np.testing.assert_allclose(records["discounted_return"], [1.75, 1.0, 2 - 0.5**6])
+    np.testing.assert_allclose(records["tip_travel_distance"], [1.5, 0.5, 3.5])
+    np.testing.assert_allclose(records["final_distance"], [3, 1, 7])
+    np.testing.assert_array_equal(records["success"], [True, False, True])
+    np.testing.assert_array_equal(records["diverged"], [False, True, False])
 
 
 def test_torques_are_means_over_the_episodes_own_steps():
@@ -39,8 +39,8 @@ def test_torques_are_means_over_the_episodes_own_steps():
 
     records = evaluate(act, CountingEnv([2, 5]), deterministic=True, seed=0)
 
-    np.testing.assert_allclose(records.torque_per_agent, np.sqrt(2.0), rtol=1e-6)
-    np.testing.assert_allclose(records.torque_joint, 2.0, rtol=1e-6)
+    np.testing.assert_allclose(records["torque_per_agent"], np.sqrt(2.0), rtol=1e-6)
+    np.testing.assert_allclose(records["torque_joint"], 2.0, rtol=1e-6)
 
 
 def test_ended_environments_cost_no_policy_evaluation_and_the_last_one_ends_the_work():
@@ -112,18 +112,18 @@ def test_an_arms_episode_is_the_sum_of_what_its_steps_say(settings):
     env.set_seed(5)
     frames = env.rollout(40, act, break_when_any_done=False)["next"]
 
-    assert records.length.tolist() == [40, 40, 40]
-    assert records.contact_steps.max() >= 3
-    assert records.discovered_bins.max() > 3
-    np.testing.assert_array_equal(records.contact_steps, (frames[entries.CONTACT_NODES] > 0).sum((1, 2)))
-    np.testing.assert_array_equal(records.discovered_bins, frames[entries.DISCOVERED][:, -1, 0])
-    np.testing.assert_array_equal(records.dropped_bins, frames[entries.DROPPED][:, -1, 0])
+    assert records["length"].tolist() == [40, 40, 40]
+    assert records["contact_steps"].max() >= 3
+    assert records["discovered_bins"].max() > 3
+    np.testing.assert_array_equal(records["contact_steps"], (frames[entries.CONTACT_NODES] > 0).sum((1, 2)))
+    np.testing.assert_array_equal(records["discovered_bins"], frames[entries.DISCOVERED][:, -1, 0])
+    np.testing.assert_array_equal(records["dropped_bins"], frames[entries.DROPPED][:, -1, 0])
     total = 0.0
     for name in entries.REWARD_TERM_NAMES:
         values = getattr(records, f"reward_{name}")
         np.testing.assert_allclose(values, frames[entries.REWARD_TERMS, name].double().sum((1, 2)), rtol=1e-12)
         total = total + values
-    np.testing.assert_allclose(records.undiscounted_return, total, rtol=1e-6)
+    np.testing.assert_allclose(records["undiscounted_return"], total, rtol=1e-6)
 
 
 def test_parts_are_evaluations_with_seeds_of_their_own(settings):
@@ -144,9 +144,9 @@ def test_parts_are_evaluations_with_seeds_of_their_own(settings):
 
 def test_what_a_task_does_not_tell_is_not_recorded(settings):
     records = evaluate_in_parts(policy(), lambda count, seed: CountingEnv([2] * count), 3, deterministic=True, seed=0)
-    assert records.length.tolist() == [2, 2, 2]
-    assert records.reward_time is None
-    assert records.contact_steps is None
+    assert records["length"].tolist() == [2, 2, 2]
+    assert records["reward_time"] is None
+    assert records["contact_steps"] is None
     assert "reward_time" not in records.rows()[0]
 
 

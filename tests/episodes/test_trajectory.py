@@ -10,7 +10,7 @@ from recorded import SEEN, WALL, leaning, recorded, untrained, watched
 from softgm_bench.assembly import build_env
 from softgm_bench.config import UserError
 from softgm_bench.envs import entries
-from softgm_bench.episodes import trajectory
+from softgm_bench.episodes import recording, trajectory
 from softgm_bench.episodes.evaluation import evaluate_in_parts, evaluation_seed
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -29,14 +29,14 @@ def test_a_recorded_episode_is_the_one_that_evaluation_counts(deterministic, ove
         seed=4,
     )
     for episode in range(EPISODES):
-        one = trajectory.record(policy, 4, episode, 40, deterministic, episodes=EPISODES)
+        one = recording.record(policy, 4, episode, 40, deterministic, episodes=EPISODES)
         assert (one.success, one.diverged, one.steps) == (
-            records.success[episode],
-            records.diverged[episode],
-            records.length[episode],
+            records["success"][episode],
+            records["diverged"][episode],
+            records["length"][episode],
         )
-        assert one.reward.astype(np.float64).sum() == records.undiscounted_return[episode]
-        assert one.contact[1:].any(axis=1).sum() == records.contact_steps[episode]
+        assert one.reward.astype(np.float64).sum() == records["undiscounted_return"][episode]
+        assert one.contact[1:].any(axis=1).sum() == records["contact_steps"][episode]
 
 
 def test_arrays_tell_the_same_as_observations_and_each_other():
@@ -77,7 +77,7 @@ def test_attention_is_recorded_if_there_is_any():
 
 
 def test_recording_attention_changes_nothing():
-    looks, does_not = (trajectory.record(untrained(*SEEN), 0, horizon=10, attention=look) for look in (True, False))
+    looks, does_not = (recording.record(untrained(*SEEN), 0, horizon=10, attention=look) for look in (True, False))
     assert looks.attention
     assert np.array_equal(looks.position, does_not.position)
 
@@ -86,7 +86,7 @@ def test_a_file_gives_back_every_bit(tmp_path):
     for one in (watched(*SEEN), recorded("task=basic", "dtype=float32")):
         path = tmp_path / "some folder" / "episode.npz"
         trajectory.save(one, path)
-        again = trajectory.record_or_load(path)
+        again = recording.record_or_load(path)
         for name in trajectory.ARRAYS:
             left, right = getattr(one, name), getattr(again, name)
             assert left.dtype == right.dtype
@@ -158,14 +158,14 @@ def test_arrays_that_do_not_belong_together_are_refused():
 )
 def test_arguments_that_make_no_sense_are_one_line(arguments, says):
     with pytest.raises(UserError, match=says):
-        trajectory.record(leaning("task=basic"), **({"seed": 0} | arguments))
+        recording.record(leaning("task=basic"), **({"seed": 0} | arguments))
 
 
 def test_what_cannot_be_read_or_written_is_one_line(tmp_path):
     with pytest.raises(UserError, match=r"absent\.npz: No such file"):
-        trajectory.record_or_load(tmp_path / "absent.npz")
+        recording.record_or_load(tmp_path / "absent.npz")
     with pytest.raises(UserError, match="takes no settings"):
-        trajectory.record_or_load(tmp_path / "absent.npz", overrides=["task=wall"])
+        recording.record_or_load(tmp_path / "absent.npz", overrides=["task=wall"])
     with pytest.raises(UserError, match=r"ends in \.npz"):
         trajectory.save(recorded("task=basic"), tmp_path / "episode.zip")
     (tmp_path / "file").touch()

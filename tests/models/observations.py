@@ -5,6 +5,7 @@ from hypothesis import strategies
 from tensordict import TensorDict
 
 from softgm_bench.envs import entries
+from softgm_bench.envs.interface import Sizes
 from softgm_bench.models import ActorConfig, SoftGMConfig, ValueConfig
 
 SEEDS = strategies.integers(0, 2**31)
@@ -21,7 +22,7 @@ def observation(lead=(4,), n_agents=4, n_slots=6, seed=0, sensed=0.4, discovered
 
     active = torch.rand(*lead, n_slots, generator=generator) < discovered
     edge = (torch.rand(*lead, n_agents, n_slots, generator=generator) < sensed) & active.unsqueeze(-2)
-    entries = {
+    values = {
         entries.AGENT_POSITION: normal(n_agents, 3),
         entries.AGENT_VELOCITY: normal(n_agents, 3),
         entries.PREVIOUS_ACTION: normal(n_agents, 2).tanh(),
@@ -32,13 +33,17 @@ def observation(lead=(4,), n_agents=4, n_slots=6, seed=0, sensed=0.4, discovered
         entries.TARGET: normal(3),
     }
     td = TensorDict({}, batch_size=lead)
-    for key, value in entries.items():
+    for key, value in values.items():
         td.set(key, value)
     return td
 
 
+SIZES = Sizes(4, 2, n_slots=6)  # of ``observation()``
+
+
 def softgm_config(**changes):
     values = {
+        "name": "softgm",
         "hidden": 8,
         "heads": 2,
         "layers": 2,

@@ -5,6 +5,7 @@ import torch
 from observations import observation, randomise, softgm_config
 
 from softgm_bench.envs import entries
+from softgm_bench.envs.interface import Sizes
 from softgm_bench.models import MLPConfig, MLPEncoder, graph
 from softgm_bench.models.action_value import ACTION_VALUE, ActionValueConfig, build_action_value
 from softgm_bench.models.mlp import MLPTeamEncoder
@@ -17,7 +18,12 @@ OWN = (entries.AGENT_POSITION, entries.AGENT_VELOCITY, entries.PREVIOUS_ACTION, 
 def critic(encoder, centralised, n_agents=5, seed=0):
     torch.manual_seed(seed)
     return randomise(
-        build_action_value(encoder, n_agents, 6, ActionValueConfig(widths=[8], mlp=None, asymmetric=False), centralised)
+        build_action_value(
+            encoder,
+            Sizes(n_agents, 2, n_slots=6),
+            ActionValueConfig(widths=[8], mlp=None, asymmetric=False),
+            centralised,
+        )
     )
 
 
@@ -122,7 +128,7 @@ def test_only_an_asymmetric_critic_reads_what_is_privileged(centralised):
     assert entries.PRIVILEGED not in plain.in_keys
     assert torch.equal(value(plain, td), value(plain, other))
     config = ActionValueConfig(widths=[8], mlp=None, asymmetric=True)
-    told = randomise(build_action_value(MLP, 5, 6, config, centralised, n_privileged=4))
+    told = randomise(build_action_value(MLP, Sizes(5, 2, n_slots=6), config, centralised, n_privileged=4))
     assert entries.PRIVILEGED in told.in_keys
     assert value(told, td).shape == (7, 5, 1)
     assert ((value(told, td) - value(told, other)).abs() > 1e-5).all()

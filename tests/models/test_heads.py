@@ -1,6 +1,6 @@
 import pytest
 import torch
-from observations import actor_config, observation, randomise, softgm_config, value_config
+from observations import SIZES, actor_config, observation, randomise, softgm_config, value_config
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from softgm_bench.envs import entries
@@ -15,7 +15,7 @@ ENCODERS = pytest.mark.parametrize(
 
 def actor(encoder=None, seed=0, **changes):
     torch.manual_seed(seed)
-    return build_actor(encoder or softgm_config(), 4, 6, actor_config(**changes))
+    return build_actor(encoder or softgm_config(), SIZES, actor_config(**changes))
 
 
 @ENCODERS
@@ -27,9 +27,9 @@ def test_shapes(encoder, lead):
     assert td[LOC].shape == td[SCALE].shape == (*lead, 4, 2)
     assert (td[entries.ACTION].abs() <= 1).all()
     for pooling in POOLINGS:
-        value = build_value(encoder, 4, 6, value_config(pooling=pooling))
+        value = build_value(encoder, SIZES, value_config(pooling=pooling))
         assert value(td)[STATE_VALUE].shape == (*lead, 1)
-    value = build_value(encoder, 4, 6, value_config(), centralised=False)
+    value = build_value(encoder, SIZES, value_config(), centralised=False)
     assert value(td)[STATE_VALUE].shape == (*lead, 4, 1)
 
 
@@ -113,14 +113,14 @@ def test_a_slot_without_an_edge_changes_no_bit_of_any_action():
 
 def test_the_value_pools_the_agents_mean():
     td = observation((5,))
-    value = build_value(softgm_config(), 4, 6, value_config())
+    value = build_value(softgm_config(), SIZES, value_config())
     expected = value.function(value.encoder(td).mean(dim=-2))
     assert torch.equal(value(td)[STATE_VALUE], expected)
 
 
 def test_the_concatenated_value_reads_every_agents_node_and_embedding_side_by_side():
     td = observation((5,))
-    value = build_value(softgm_config(), 4, 6, value_config(pooling="concat"))
+    value = build_value(softgm_config(), SIZES, value_config(pooling="concat"))
     parts = [graph.agent_channels(td), value.encoder.encoder(td)]
     agents = [torch.cat([part[:, agent] for part in parts], dim=-1) for agent in range(4)]
     assert torch.equal(value(td)[STATE_VALUE], value.function(torch.cat(agents, dim=-1)))
@@ -130,15 +130,15 @@ def test_the_concatenated_value_reads_every_agents_node_and_embedding_side_by_si
 def test_a_critic_may_have_an_mlp_of_its_own_whatever_the_actors_model(encoder):
     mlp = MLPConfig(hidden=8, layers=1, velocity_scale=1.0)
     config = value_config(pooling="concat", mlp=mlp)
-    assert isinstance(build_value(encoder, 4, 6, config).encoder, MLPTeamEncoder)
-    assert isinstance(build_value(encoder, 4, 6, config, centralised=False).head.encoder, MLPEncoder)
+    assert isinstance(build_value(encoder, SIZES, config).encoder, MLPTeamEncoder)
+    assert isinstance(build_value(encoder, SIZES, config, centralised=False).head.encoder, MLPEncoder)
 
 
 @ENCODERS
 @pytest.mark.parametrize("pooling", POOLINGS)
 def test_a_centralised_critic_sees_every_agent(encoder, pooling):
     torch.manual_seed(0)
-    value = randomise(build_value(encoder, 4, 6, value_config(pooling=pooling)))
+    value = randomise(build_value(encoder, SIZES, value_config(pooling=pooling)))
     for agent in range(4):
         td = observation((5,))
         before = value(td.clone())[STATE_VALUE]
@@ -155,7 +155,7 @@ def test_an_independent_critic_sees_of_each_agent_what_its_actor_sees(entry, mov
     """The MLP's agents see their own entries, SoftGM's (here one layer) also what their neighbours tell them."""
     for encoder, reach in ((MLPConfig(hidden=8, layers=2, velocity_scale=1.0), 0), (softgm_config(layers=1), 1)):
         torch.manual_seed(0)
-        value = randomise(build_value(encoder, 4, 6, value_config(), centralised=False)).double()
+        value = randomise(build_value(encoder, SIZES, value_config(), centralised=False)).double()
         td = observation((5,), sensed=0.6, discovered=1.0, dtype=torch.float64)
         other = td.clone()
         other[entry][:, moved] = ~td[entry][:, moved] if entry == entries.EDGE else td[entry][:, moved] + 1.0
@@ -177,11 +177,11 @@ def test_privileged_channels_enter_the_heads_that_are_built_for_them_and_no_othe
             return torch.equal(network(td.clone())[key], network(other.clone())[key])
 
     for known in (0, 3):
-        network = build_actor(softgm_config(), 4, 6, actor_config(), n_privileged=known)
+        network = build_actor(softgm_config(), SIZES, actor_config(), n_privileged=known)
         assert (entries.PRIVILEGED in network.in_keys) is bool(known)
         assert same(network, LOC) is not bool(known)
         for centralised, pooling in ((True, "mean"), (True, "concat"), (False, "mean")):
-            value = build_value(softgm_config(), 4, 6, value_config(pooling=pooling), centralised, known)
+            value = build_value(softgm_config(), SIZES, value_config(pooling=pooling), centralised, known)
             assert (entries.PRIVILEGED in value.in_keys) is bool(known)
             assert same(value, STATE_VALUE) is not bool(known)
 
@@ -192,7 +192,7 @@ def test_an_unknown_pooling_is_refused():
 
 
 def test_actor_and_critic_share_no_parameter():
-    policy, value = actor(), build_value(softgm_config(), 4, 6, value_config())
+    policy, value = actor(), build_value(softgm_config(), SIZES, value_config())
     assert not {id(p) for p in policy.parameters()} & {id(p) for p in value.parameters()}
 
 

@@ -3,6 +3,7 @@ from hypothesis import given, settings
 from observations import LEADS, SEEDS, SIZES, observation, randomise
 
 from softgm_bench.envs import entries
+from softgm_bench.envs.interface import Sizes
 from softgm_bench.models import MLPConfig, MLPEncoder, graph
 from softgm_bench.models.mlp import MLPTeamEncoder
 
@@ -11,7 +12,9 @@ from softgm_bench.models.mlp import MLPTeamEncoder
 @given(LEADS, SIZES, SEEDS)
 def test_it_is_an_mlp_on_the_flat_observation(lead, sizes, seed):
     torch.manual_seed(seed)
-    model = randomise(MLPEncoder(MLPConfig(hidden=7, layers=2, velocity_scale=1.0), *sizes)).double()
+    model = randomise(
+        MLPEncoder(MLPConfig(hidden=7, layers=2, velocity_scale=1.0), Sizes(sizes[0], 2, n_slots=sizes[1]))
+    ).double()
     td = observation(lead, *sizes, seed=seed, dtype=torch.float64)
     plain = torch.nn.Sequential(model.first, torch.nn.Tanh(), model.rest[0], torch.nn.Tanh())
     out = model(td)
@@ -20,7 +23,7 @@ def test_it_is_an_mlp_on_the_flat_observation(lead, sizes, seed):
 
 
 def test_it_knows_undiscovered_slots_by_nothing():
-    model = MLPEncoder(MLPConfig(hidden=7, layers=1, velocity_scale=0.5), 4, 6)
+    model = MLPEncoder(MLPConfig(hidden=7, layers=1, velocity_scale=0.5), SIZES)
     td = observation((5,), 4, 6)
     changed = td.clone()
     changed[entries.SLOT_DESCRIPTOR] = torch.where(
@@ -35,7 +38,7 @@ def test_the_teams_is_an_mlp_on_every_distinct_number_of_the_flat_observations(l
     n_agents, n_slots = sizes
     torch.manual_seed(seed)
     config = MLPConfig(hidden=7, layers=2, velocity_scale=1.0)
-    model = randomise(MLPTeamEncoder(config, n_agents, n_slots, 3)).double()
+    model = randomise(MLPTeamEncoder(config, Sizes(n_agents, 2, n_slots=n_slots), 3)).double()
     td = observation(lead, *sizes, seed=seed, dtype=torch.float64)
     further = torch.randn(*lead, 3, dtype=torch.float64)
     flat = graph.flat_observation(td)

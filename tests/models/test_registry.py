@@ -1,5 +1,5 @@
 import pytest
-from observations import softgm_config
+from observations import SIZES, softgm_config
 
 from softgm_bench.models import (
     MLPConfig,
@@ -14,14 +14,14 @@ from softgm_bench.models.registry import register_model
 
 
 def test_the_configuration_chooses_the_encoder():
-    assert isinstance(build_encoder(softgm_config(), 4, 6), SoftGMEncoder)
-    assert isinstance(build_encoder(MLPConfig(hidden=8, layers=1, velocity_scale=1.0), 4, 6), MLPEncoder)
+    assert isinstance(build_encoder(softgm_config(), SIZES), SoftGMEncoder)
+    assert isinstance(build_encoder(MLPConfig(hidden=8, layers=1, velocity_scale=1.0), SIZES), MLPEncoder)
     assert model_configs() == {"softgm": SoftGMConfig, "mlp": MLPConfig, "vector_mlp": VectorMLPConfig}
 
 
 def test_a_configuration_of_no_model_is_refused():
     with pytest.raises(ValueError, match="no model's configuration"):
-        build_encoder({"hidden": 8}, 4, 6)
+        build_encoder({"hidden": 8}, SIZES)
 
 
 def test_a_name_is_registered_once():

@@ -16,14 +16,14 @@ SWITCHES = [
 
 def encoder(dtype=torch.float32, seed=0, **changes):
     torch.manual_seed(seed)
-    return randomise(SoftGMEncoder(softgm_config(**changes), n_agents=4, n_slots=6)).to(dtype)
+    return randomise(SoftGMEncoder(softgm_config(**changes), SIZES)).to(dtype)
 
 
 @pytest.mark.parametrize("switches", SWITCHES, ids=str)
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-6), (torch.float64, 1e-12)])
 def test_sparse_equals_dense(switches, dtype, tolerance):
     torch.manual_seed(0)
-    model = SoftGMEncoder(softgm_config(velocity_scale=0.5, hidden=128, heads=4, **switches), 4, 6).to(dtype)
+    model = SoftGMEncoder(softgm_config(velocity_scale=0.5, hidden=128, heads=4, **switches), SIZES).to(dtype)
     td = observation((2, 5), 4, 6, dtype=dtype)
     sparse, weights = model.forward_with_attention(td)
     dense, expected = model.forward_dense(td)

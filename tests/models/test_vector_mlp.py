@@ -2,18 +2,20 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from softgm_bench.envs.interface import Sizes
 from softgm_bench.envs.vmas import OBSERVATION
 from softgm_bench.models import VectorMLPConfig, build_encoder
 from softgm_bench.models.action_value import ACTION_VALUE, ActionValueConfig, build_action_value
 from softgm_bench.models.heads import STATE_VALUE, ValueConfig, build_value
 
 AGENTS, FEATURES = 3, 5
+SIZES = Sizes(AGENTS, 2, n_features=FEATURES)
 
 
 def observation(size=4):
     generator = torch.Generator().manual_seed(0)
     agents = {
-        "observation": torch.randn(size, AGENTS, FEATURES, generator=generator),
+        "observation": torch.randn(size, SIZES, generator=generator),
         "action": torch.randn(size, AGENTS, 2, generator=generator).tanh(),
     }
     return TensorDict({"agents": TensorDict(agents, [size, AGENTS])}, [size])
@@ -21,14 +23,14 @@ def observation(size=4):
 
 def test_without_layers_the_embedding_is_the_observation():
     td = observation()
-    encoder = build_encoder(VectorMLPConfig([]), AGENTS, FEATURES)
+    encoder = build_encoder(VectorMLPConfig([]), SIZES)
     assert torch.equal(encoder(td), td[OBSERVATION])
     assert encoder.own(td).shape == (4, AGENTS, 0)
 
 
 def test_an_embedding_is_of_one_agents_observation_alone():
     td = observation()
-    encoder = build_encoder(VectorMLPConfig([7, 6]), AGENTS, FEATURES)
+    encoder = build_encoder(VectorMLPConfig([7, 6]), SIZES)
     before = encoder(td)
     assert before.shape == (4, AGENTS, 6)
     td[OBSERVATION][:, 1] += 1.0
@@ -40,9 +42,9 @@ def test_an_embedding_is_of_one_agents_observation_alone():
 def test_critics_are_benchmarls_one_mlp_of_everything_they_may_read(centralised):
     td, config = observation(), VectorMLPConfig([])
     of_state = ValueConfig(widths=[8], pooling="concat", mlp=None, asymmetric=False)
-    value = build_value(config, AGENTS, FEATURES, of_state, centralised)
+    value = build_value(config, SIZES, of_state, centralised)
     of_action = ActionValueConfig(widths=[8], mlp=None, asymmetric=False)
-    of_actions = build_action_value(config, AGENTS, FEATURES, of_action, centralised)
+    of_actions = build_action_value(config, SIZES, of_action, centralised)
     seen, acted = td[OBSERVATION], td["agents", "action"]
     if centralised:
         expected = value.function(seen.flatten(1))

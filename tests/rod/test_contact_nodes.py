@@ -7,9 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from dense import force_dense
 from softgm_bench.rod.contact import element_radius
 from softgm_bench.rod.contact_nodes import contact_nodes, contact_nodes_dense, point_segment_distance
-from softgm_bench.rod.dense import force_dense
 from softgm_bench.rod.parameters import RodParameters, rod_constants
 from softgm_bench.rod.state import Cylinders, straight_rods
 

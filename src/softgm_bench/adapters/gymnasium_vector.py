@@ -17,9 +17,9 @@ from omegaconf.errors import OmegaConfBaseException
 from tensordict import TensorDictBase
 
 from softgm_bench import plugins
-from softgm_bench.assembly import configure
-from softgm_bench.config import UserError, dtype_of
-from softgm_bench.envs import entries, make_env
+from softgm_bench.assembly import build_env, configure
+from softgm_bench.config import UserError
+from softgm_bench.envs import entries
 from softgm_bench.envs.soft_arm import SoftArmEnv
 from softgm_bench.envs.tasks import TASKS
 
@@ -71,17 +71,7 @@ def build_arm(
         config = configure([f"task={task}", *overrides])
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(_one_line(error)) from error
-    return make_env(
-        config.task,
-        config.rod,
-        num_envs,
-        checked_seed(seed),
-        horizon,
-        config.device,
-        config.backend,
-        dtype_of(config),
-        perturbation=config.perturbation,
-    )
+    return build_env(config, num_envs, checked_seed(seed), horizon)
 
 
 def checked_seed(seed: int) -> int:
