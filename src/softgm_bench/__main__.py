@@ -1,6 +1,7 @@
 """Train and evaluate: ``python -m softgm_bench algo=softgm task=wall seed=0``; with ``-m``, each cell of a grid."""
 
 import os
+import runpy
 import signal
 import sys
 from types import FrameType
@@ -10,14 +11,30 @@ import hydra
 from hydra._internal.utils import get_args_parser
 from omegaconf import DictConfig
 
+from softgm_bench import process
 from softgm_bench.config import UserError, composing, config_directory, typed
 from softgm_bench.config.explain import USER_ERRORS, explain
 from softgm_bench.sweeps import cell as sweep_cell
 from softgm_bench.sweeps import launch as sweep
 
+COMMANDS = ("attention", "evaluate", "export", "render", "replay", "report", "status")
+
+
+def console() -> int:
+    """Run ``softgm-bench [COMMAND] ...``: one of ``COMMANDS``, ``train``, or without a name training too."""
+    name = sys.argv[1] if len(sys.argv) > 1 else ""
+    if name in COMMANDS:
+        del sys.argv[1]
+        runpy.run_module(f"softgm_bench.{name}", run_name="__main__", alter_sys=True)
+        return 0
+    if name == "train":
+        del sys.argv[1]
+    return main()
+
 
 def main() -> int:
     """Run what the command line says; 0 when all went well, 2 after a user's error, 128 + signal when interrupted."""
+    process.prepare()
     debugging = os.environ.get("HYDRA_FULL_ERROR") == "1"
     os.environ["HYDRA_FULL_ERROR"] = "1"  # let errors through instead of printing and leaving
     try:

@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
+from softgm_bench import process
 from softgm_bench.config import CHANGEABLE, UserError
 from softgm_bench.config.explain import USER_ERRORS, explain
 
@@ -29,6 +30,7 @@ def run(name: str, text: str | None, body: Callable[[list[str]], None]) -> int:
     Returns:
         The exit status: 0; 2 after one line about what is wrong; 130 when interrupted.
     """
+    process.prepare()
     arguments = sys.argv[1:]
     if {"-h", "--help"} & set(arguments):
         print((text or "").strip())

@@ -24,6 +24,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
+from softgm_bench import process
 from softgm_bench.config import typed
 from softgm_bench.config.comparison import ABSENT, differences
 from softgm_bench.config.explain import USER_ERRORS, explain
@@ -170,6 +171,7 @@ def _leave(number: int, run_dir: str, overrides: list[str], outcome: Mapping[str
 
 def main() -> int:
     """Train the job on standard input; the last line on standard output says what came of it."""
+    process.prepare()
     job = json.loads(sys.stdin.read())
     _stop_with(job["parent"])
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "w")
