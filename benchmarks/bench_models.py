@@ -94,10 +94,10 @@ def main() -> None:
     keep_memory()
     torch.manual_seed(0)
 
-    config = compose(["algo=softgm"]).model
+    config = compose(["algo=softgm", "recipe=paper"]).model
     encoders = {
         "softgm": build_encoder(config, N_AGENTS, N_SLOTS),
-        "mlp": build_encoder(compose(["model=mlp"]).model, N_AGENTS, N_SLOTS),
+        "mlp": build_encoder(compose(["model=mlp", "recipe=paper"]).model, N_AGENTS, N_SLOTS),
         "torch_geometric": Geometric(config),
     }
     rows = []

@@ -39,6 +39,7 @@ def observation(lead=(4,), n_agents=4, n_slots=6, seed=0, sensed=0.4, discovered
 
 def softgm_config(**changes):
     values = {
+        "name": "softgm",
         "hidden": 8,
         "heads": 2,
         "layers": 2,
