@@ -13,7 +13,7 @@ $(STAMP): pyproject.toml constraints.txt
 	touch $@
 
 train: setup
-	$(BIN)/python -m softgm_bench algo=softgm task=basic seed=0 recipe=open experiment=quick
+	$(BIN)/python -m softgm_bench algo=softgm task=basic seed=0 experiment=quick
 
 test: setup
 	$(BIN)/python -m pytest

@@ -113,13 +113,14 @@ def environment_steps_per_second(
 
 
 def training_frames_per_second(task: str, num_envs: int, overrides: list[str]) -> float:
-    """Of the last of four iterations of PPO with the default recipe: collection and update together."""
+    """Of the last of four iterations of PPO with the paper's recipe: collection and update together."""
     steps = 10
     with tempfile.TemporaryDirectory() as folder:
         config = compose(
             [
                 f"task={task}",
                 "algo=softgm",
+                "recipe=paper",
                 "experiment=smoke",
                 f"experiment.num_envs={num_envs}",
                 f"experiment.steps_per_batch={steps}",

@@ -95,10 +95,10 @@ def main() -> None:
     keep_memory()
     torch.manual_seed(0)
 
-    config = compose(["algo=softgm"]).model
+    config = compose(["algo=softgm", "recipe=paper"]).model
     encoders = {
         "softgm": build_encoder(config, Sizes(N_AGENTS, 2, n_slots=N_SLOTS)),
-        "mlp": build_encoder(compose(["model=mlp"]).model, Sizes(N_AGENTS, 2, n_slots=N_SLOTS)),
+        "mlp": build_encoder(compose(["model=mlp", "recipe=paper"]).model, Sizes(N_AGENTS, 2, n_slots=N_SLOTS)),
         "torch_geometric": Geometric(config),
     }
     rows = []

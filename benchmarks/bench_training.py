@@ -1,7 +1,7 @@
 """Training throughput: frames per second of the whole loop, per algorithm and task, and where the time goes.
 
 ``python benchmarks/bench_training.py`` prints a table and writes the raw figures. Each cell collects and updates as a
-run with ``recipe=open`` does, from its first iteration on; evaluations are left out. Memory is warmed up and random
+run with ``recipe=tuned`` does, from its first iteration on; evaluations are left out. Memory is warmed up and random
 exploration of the off-policy algorithms cut short, so that every measured iteration takes its gradient steps. The time
 is split into the simulator (with sensing, rewards and resets), the policy's actions, the update, and the rest, which is
 TorchRL's collector. Each figure is that of the fastest repetition.
@@ -33,7 +33,7 @@ def measure(algo: str, task: str, repetitions: int) -> dict[str, Any]:
     """The fastest repetition: frames per second and each part's share."""
     off_policy = algo in OFF_POLICY
     config = compose(
-        [f"algo={algo}", f"task={task}", "recipe=open", "experiment=quick"]
+        [f"algo={algo}", f"task={task}", "recipe=tuned", "experiment=quick"]
         + (["algo.random_frames=0"] if off_policy else [])
     )
     settings = config.experiment

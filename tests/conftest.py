@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from softgm_bench.config import Config, compose
+from softgm_bench.assembly import configure
+from softgm_bench.config import Config
 
 torch.set_num_threads(2)
 
@@ -12,12 +13,12 @@ TASKS = ("basic", "structured", "wall", "wall_narrow", "wall_fixed")
 
 @pytest.fixture(scope="session")
 def settings():
-    """Checked configuration from overrides, e.g. ``settings("task=wall")``."""
+    """Checked configuration from overrides of the paper's, e.g. ``settings("task=wall")``."""
     known: dict[tuple[str, ...], Config] = {}
 
     def build(*overrides: str) -> Config:
         if overrides not in known:
-            known[overrides] = compose(list(overrides))
+            known[overrides] = configure(["recipe=paper", *overrides])
         return known[overrides]
 
     return build

@@ -8,7 +8,8 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from softgm_bench.config import UserError, compose
+from softgm_bench.assembly import configure
+from softgm_bench.config import UserError
 from softgm_bench.config.explain import USER_ERRORS, explain
 from softgm_bench.episodes import policy, trajectory
 from softgm_bench.runs import checkpoint
@@ -112,7 +113,7 @@ def test_nothing_in_a_file_is_run(tmp_path: Path):
 def test_settings_of_any_kind_make_a_configuration_or_one_line(overrides: list[str]):
     line = "composed"
     try:
-        compose(overrides)
+        configure(overrides)
     except USER_ERRORS as error:
         line = explain(error, overrides)
     assert line.strip()

@@ -22,6 +22,7 @@ def overrides(cell: Cell, run_dir: str, threads: int) -> list[str]:
         f"task=vmas_{cell.task}",
         f"algo={cell.algo}",
         "model=vector_mlp",
+        "recipe=paper",
         f"seed={cell.seed}",
         f"threads={threads}",
         f"run_dir={run_dir}",

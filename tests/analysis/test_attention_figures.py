@@ -96,10 +96,10 @@ def test_strips_of_an_agent_add_up_to_one(episode):
     assert np.allclose(np.nan_to_num(to_obstacles) + own_share, 1.0, atol=1e-6)
 
 
-@pytest.mark.parametrize("algo", ["softgm_no_stage1", "softgm_no_stage2"])
-def test_an_ablation_draws_the_stage_that_it_has(algo):
-    one = watched(*SEEN, f"algo={algo}", horizon=4)
-    assert set(one.attention) == {"stage2" if algo.endswith("1") else "stage1"}
+@pytest.mark.parametrize("model", ["softgm_no_stage1", "softgm_no_stage2"])
+def test_an_ablation_draws_the_stage_that_it_has(model):
+    one = watched(*SEEN, f"model={model}", horizon=4)
+    assert set(one.attention) == {"stage2" if model.endswith("1") else "stage1"}
     assert len(meshes(attention.draw_step(one, 1))) == 2
     assert attention.draw_overview(one).axes
 

@@ -10,7 +10,8 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from dense import force_dense
-from softgm_bench.config import UserError, compose
+from softgm_bench.assembly import configure
+from softgm_bench.config import UserError
 from softgm_bench.envs.curriculum import difficulty, first_progress, note_ends
 from softgm_bench.envs.tasks import make_task
 from softgm_bench.envs.tasks.base import CurriculumConfig, eased
@@ -290,7 +291,7 @@ def test_targets_of_the_other_tasks_fill_ranges_between_the_easiest_and_their_ow
 )
 def test_values_by_which_nothing_could_be_decided_or_drawn_are_refused(override, message):
     with pytest.raises(UserError, match=message):
-        compose(["task=wall", ENABLED, override])
+        configure(["task=wall", ENABLED, override])
 
 
 def test_columns_of_a_wide_opening_are_never_dropped_unnoticed(settings):

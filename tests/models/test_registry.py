@@ -1,3 +1,5 @@
+from dataclasses import dataclass
+
 import pytest
 from observations import SIZES, softgm_config
 
@@ -16,7 +18,8 @@ from softgm_bench.models.registry import register_model
 def test_the_configuration_chooses_the_encoder():
     assert isinstance(build_encoder(softgm_config(), SIZES), SoftGMEncoder)
     assert isinstance(build_encoder(MLPConfig(hidden=8, layers=1, velocity_scale=1.0), SIZES), MLPEncoder)
-    assert model_configs() == {"softgm": SoftGMConfig, "mlp": MLPConfig, "vector_mlp": VectorMLPConfig}
+    softgm = dict.fromkeys(("softgm", "softgm_no_stage1", "softgm_no_stage2"), SoftGMConfig)
+    assert model_configs() == softgm | {"mlp": MLPConfig, "vector_mlp": VectorMLPConfig}
 
 
 def test_a_configuration_of_no_model_is_refused():
@@ -27,3 +30,13 @@ def test_a_configuration_of_no_model_is_refused():
 def test_a_name_is_registered_once():
     with pytest.raises(ValueError, match="registered already"):
         register_model("softgm", config=dict)(MLPEncoder)
+
+
+def test_settings_that_several_names_share_say_which_it_is():
+    @dataclass
+    class Nameless:
+        hidden: int
+
+    with pytest.raises(ValueError, match="Nameless is shared by one, another: it needs a field name: str"):
+        register_model("one", "another", config=Nameless)(MLPEncoder)
+    assert "one" not in model_configs()

@@ -14,6 +14,7 @@ from softgm_bench.runs import checkpoint
 
 TINY = (
     "experiment=smoke",
+    "recipe=paper",
     "threads=1",
     "experiment.total_frames=160",
     "experiment.num_envs=4",

@@ -2,6 +2,7 @@
 
 import csv
 import math
+from itertools import product
 
 import pytest
 import torch
@@ -16,16 +17,11 @@ from softgm_bench.runs.loop import train
 
 TASKS = ("basic", "structured", "wall", "wall_narrow", "wall_fixed")
 ALGORITHMS = tuple(algorithm_configs())
-ON_POLICY = ("softgm", "softgm_no_stage1", "softgm_no_stage2", "ippo", "mappo")
-MODELS = ("mlp", "softgm")
-# An ablation names switches of SoftGM's encoder, so it has no other model.
-PAIRS = [
-    (algo, model)
-    for algo in ALGORITHMS
-    for model in MODELS
-    if model == "softgm" or not algo.startswith("softgm_no_stage")
-]
-CROSSED = [(algo, model) for algo, model in PAIRS if (model == "softgm") is not algo.startswith("softgm")]
+ON_POLICY = ("softgm", "ippo", "mappo")
+ABLATIONS = ("softgm_no_stage1", "softgm_no_stage2")  # models of SoftGM's algorithm
+PAIRS = [*product(ALGORITHMS, ("mlp", "softgm")), *product(("softgm",), ABLATIONS)]
+OWN = {algo: "softgm" if algo == "softgm" else "mlp" for algo in ALGORITHMS}
+CROSSED = [(algo, model) for algo, model in PAIRS if model not in (OWN[algo], *ABLATIONS)]
 TINY = (
     "experiment=smoke",
     "threads=1",
@@ -71,20 +67,21 @@ def check_run(folder, algo, *overrides):
 
 
 @pytest.mark.parametrize("task", TASKS)
-@pytest.mark.parametrize("algo", ALGORITHMS)
-def test_every_algorithm_trains_on_every_task(tmp_path, algo, task):
-    check_run(tmp_path, algo, f"task={task}")
+@pytest.mark.parametrize(("algo", "model"), [*OWN.items(), *product(("softgm",), ABLATIONS)])
+def test_every_algorithm_trains_on_every_task(tmp_path, algo, model, task):
+    summary = check_run(tmp_path, algo, f"task={task}", f"model={model}")
+    assert (summary["model"], summary["algo"]) == (model, model if model in ABLATIONS else algo)
 
 
 @pytest.mark.parametrize(("algo", "model"), CROSSED)
 def test_every_algorithm_trains_with_the_other_model_on_the_wall(tmp_path, algo, model):
-    summary = check_run(tmp_path, algo, "task=wall", f"model={model}", "recipe=open")
+    summary = check_run(tmp_path, algo, "task=wall", f"model={model}", "recipe=tuned")
     assert (summary["model"], summary["algo"]) == (model, f"{algo}_{model}")
 
 
-@pytest.mark.parametrize("algo", ALGORITHMS)
-def test_every_algorithm_trains_with_an_asymmetric_critic(tmp_path, algo):
-    check_run(tmp_path, algo, "task=wall", "algo.critic.asymmetric=true")
+@pytest.mark.parametrize(("algo", "model"), [*OWN.items(), *product(("softgm",), ABLATIONS)])
+def test_every_algorithm_trains_with_an_asymmetric_critic(tmp_path, algo, model):
+    check_run(tmp_path, algo, "task=wall", f"model={model}", "algo.critic.asymmetric=true")
 
 
 @pytest.fixture(scope="module")
@@ -133,9 +130,9 @@ def test_every_policy_reads_the_observation_and_nothing_else(algo, model, wall):
         assert not torch.equal(act(policy, observed), act(policy, other))
 
 
-@pytest.mark.parametrize("algo", ALGORITHMS)
-def test_no_policy_reads_what_its_asymmetric_critic_is_told(algo, wall):
-    policy, td = built(algo, "softgm", wall, "algo.critic.asymmetric=true").policy, scene(wall)
+@pytest.mark.parametrize(("algo", "model"), [*product(ALGORITHMS, ("softgm",)), *product(("softgm",), ABLATIONS)])
+def test_no_policy_reads_what_its_asymmetric_critic_is_told(algo, model, wall):
+    policy, td = built(algo, model, wall, "algo.critic.asymmetric=true").policy, scene(wall)
     other = td.clone()
     other[entries.PRIVILEGED] += 1.0
     assert set(policy.in_keys) == set(entries.OBSERVATION)
@@ -153,5 +150,5 @@ def test_execution_is_decentralised(algo, model, moved, wall):
         other[key][:, moved] = td[key][:, moved] * 0.5 + 0.1
     other[entries.EDGE][:, moved] = td[entries.SLOT_ACTIVE] & ~td[entries.EDGE][:, moved]
     changed = ((act(policy, td) - act(policy, other)).abs() > 1e-11).any(dim=-1).any(dim=0).tolist()
-    reach = 2 if model == "softgm" and algo != "softgm_no_stage2" else 0
+    reach = 2 if model in ("softgm", "softgm_no_stage1") else 0
     assert changed == [abs(agent - moved) <= reach for agent in range(6)]

@@ -97,7 +97,7 @@ def test_a_finished_run_holds_what_its_settings_promise(tmp_path):
 
 
 @pytest.mark.parametrize("task", ["basic", "structured", "wall", "wall_narrow", "wall_fixed"])
-@pytest.mark.parametrize("recipe", ["paper", "open"])
+@pytest.mark.parametrize("recipe", ["paper", "tuned"])
 def test_every_task_trains_under_both_recipes(tmp_path, task, recipe):
     rows = trained(tmp_path, f"task={task}", f"recipe={recipe}", "model.hidden=16")
     assert len(rows) == 3

@@ -7,11 +7,13 @@ import sys
 
 import pytest
 
-from softgm_bench.config import UserError, compose
+from softgm_bench.assembly import configure
+from softgm_bench.config import UserError
 from softgm_bench.runs.loop import train
 
 SMALL = (
     "model=vector_mlp",
+    "recipe=paper",
     "experiment=smoke",
     "threads=1",
     "experiment.total_frames=64",
@@ -33,7 +35,7 @@ def _vmas():
 @pytest.mark.parametrize("algo", ["ippo", "mappo", "iddpg", "maddpg", "isac", "masac"])
 def test_every_algorithm_trains_on_it(algo, tmp_path):
     own = () if algo.endswith("ppo") else OFF_POLICY
-    summary = train(compose(["task=vmas_balance", f"algo={algo}", f"run_dir={tmp_path / 'run'}", *SMALL, *own]))
+    summary = train(configure(["task=vmas_balance", f"algo={algo}", f"run_dir={tmp_path / 'run'}", *SMALL, *own]))
 
     assert summary["final_evaluation"]["episodes"] == 3
     assert {"undiscounted_return", "episode_length"} <= summary["final_evaluation"].keys()
@@ -60,11 +62,11 @@ def test_every_algorithm_trains_on_it(algo, tmp_path):
 )
 def test_what_does_not_fit_is_refused_in_one_line(overrides, said):
     with pytest.raises(UserError, match=said) as caught:
-        compose(overrides)
+        configure(["recipe=paper", *overrides])
     assert "\n" not in str(caught.value)
 
 
 def test_without_vmas_one_line_says_how_to_get_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "vmas", None)  # an import then fails
     with pytest.raises(UserError, match=r"needs VMAS: pip install 'softgm-bench\[vmas\]'"):
-        compose(["task=vmas_navigation", "algo=mappo", "model=vector_mlp"])
+        configure(["recipe=paper", "task=vmas_navigation", "algo=mappo", "model=vector_mlp"])

@@ -68,32 +68,30 @@ def test_cells_are_the_product_in_the_order_of_the_jobs():
 
 
 def test_a_grids_value_gives_way_to_the_command_lines():
-    found, _ = sweep.cells(["+experiments=ablation", "algo=softgm", "seed=7"])
+    found, _ = sweep.cells(["+grids=ablation", "model=softgm", "seed=7"])
     assert [str(cell.run_dir) for cell in found] == ["outputs/full/wall/softgm/seed7"]
 
 
 @pytest.mark.parametrize("size", ["", "_smoke"])
 def test_named_grids_have_the_papers_cells_and_share_those_that_are_the_same(size):
-    cells = {grid: sweep.cells([f"+experiments={grid}{size}"])[0] for grid in ("table2", "ablation")}
+    cells = {grid: sweep.cells([f"+grids={grid}{size}"])[0] for grid in ("table2", "ablation")}
     softgm = {cell.run_dir for cell in cells["table2"]}
     ablations = {cell.run_dir for cell in cells["ablation"]}
     assert len(softgm) == 3
     assert len(ablations) == 9
     assert softgm < ablations
-    assert softgm == {
-        cell.run_dir for cell in sweep.cells([f"+experiments=table1{size}", "algo=softgm", "task=wall"])[0]
-    }
+    assert softgm == {cell.run_dir for cell in sweep.cells([f"+grids=table1{size}", "algo=softgm", "task=wall"])[0]}
 
 
 def test_table_one_has_every_algorithm_task_and_seed():
-    params = OmegaConf.load(config_directory() / "experiments" / "table1.yaml").hydra.sweeper.params
+    params = OmegaConf.load(config_directory() / "grids" / "table1.yaml").hydra.sweeper.params
     assert sorted(params.algo.split(",")) == ["iddpg", "ippo", "isac", "maddpg", "mappo", "masac", "softgm"]
     assert (params.task, params.seed) == ("basic,structured,wall", "0,1,2")
 
 
 @pytest.mark.parametrize(("grid", "frames"), [("table1", 3_000_000), ("table1_smoke", 384)])
 def test_a_grids_settings_are_a_valid_run(settings, grid, frames):
-    (cell,), _ = sweep.cells([f"+experiments={grid}", "algo=mappo", "seed=1", "task=wall"])
+    (cell,), _ = sweep.cells([f"+grids={grid}", "algo=mappo", "seed=1", "task=wall"])
     config = settings(*cell.overrides)
     assert (config.experiment.total_frames, config.seed, config.task.name) == (frames, 1, "wall")
 
@@ -145,4 +143,4 @@ def test_a_cell_that_leaves_no_word_is_not_taken_for_done(tmp_path, capsys):
 
 
 def test_jobs_of_a_named_grid_are_counted_without_composing_them():
-    assert sweep.plan(["+experiments=table1", "task=basic"]).jobs == 21
+    assert sweep.plan(["+grids=table1", "task=basic"]).jobs == 21

@@ -1,0 +1,92 @@
+import pytest
+from refused import refusal
+
+from softgm_bench.assembly import configure
+from softgm_bench.config import UserError, compose, validate
+
+
+def test_mistakes_in_perturbations_are_one_line():
+    assert refusal("perturbation=nois").startswith("perturbation=nois: no such perturbation; choose one of disturbance")
+    assert refusal("perturbation.sigma=1").startswith("perturbation.sigma: no such key; did you mean perturbation.")
+    assert refusal("perturbation.position_sigma=1").startswith("perturbation.position_sigma is 1.0 with perturbation=")
+    absent = refusal("perturbation=section_failure", "perturbation.failed_agents=[7]")
+    assert absent == "perturbation.failed_agents holds 7: the 6 agents are 0 to 5"
+    vmas = refusal("perturbation=noise", "task=vmas_balance", "model=vector_mlp")
+    assert vmas == "perturbation=noise: task=vmas_balance has no arm; it must be none"
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        "seed=-1",
+        "threads=0",
+        "threads=100000",
+        "device=gpu",
+        "device=cuda",
+        "backend=jax",
+        "dtype=float16",
+        "run_dir=''",
+        "experiment.total_frames=0",
+        "experiment.num_envs=-2",
+        "experiment.steps_per_batch=0",
+        "experiment.train_horizon=0",
+        "task.train_horizon=0",
+        "experiment.evaluation.interval=0",
+        "experiment.evaluation.episodes=0",
+        "experiment.evaluation.final_episodes=0",
+        "experiment.evaluation.horizon=0",
+        "experiment.evaluation.final_horizon=0",
+        "experiment.checkpoint.interval=0",
+        "experiment.checkpoint.keep=0",
+        "rod.n_elements=1",
+        "task.n_agents=0",
+        "task.horizon=0",
+        "task.success_radius=0.0",
+        "task.min_dilatation=1.5",
+        "task.actuation.basis=linear",
+        "task.actuation.scaling=total",
+        "observation=all",
+        "algo.epochs=0",
+        "algo.minibatch_size=0",
+        "algo.gamma=1.5",
+        "algo.actor_lr=0.0",
+        "algo.entropy_coeff=-1.0",
+        "algo.lr_schedule=cosine",
+        "algo.value_norm_decay=1.0",
+        "algo.critic.pooling=max",
+        "algo.actor.initial_sigma=9.0",
+        "algo.actor.persistence=1.0",
+    ],
+)
+def test_values_without_sense_are_refused_by_name(override):
+    key, _, value = override.partition("=")
+
+    with pytest.raises(UserError) as caught:
+        configure([override])
+
+    assert str(caught.value).startswith(key)
+    assert value.strip("'") in str(caught.value)
+
+
+def test_a_backend_and_a_device_that_do_not_fit_are_refused_in_one_line():
+    assert "backend=numba" in refusal("device=cuda", "backend=numba")
+    assert "choose backend=cuda" in refusal("device=cuda", "backend=numba")
+    assert "device=cuda" in refusal("backend=cuda")
+
+
+def test_what_only_building_can_refuse_is_refused_with_the_rest_and_not_by_composing():
+    for overrides, message in (
+        (["task=wall", "task.max_path=0.1"], "no admissible pair of opening and target"),
+        (["task=wall", "task.opening_side=2.0"], "task.opening_z"),
+        (["model.heads=3"], "heads=3"),
+    ):
+        with pytest.raises(UserError, match=message):
+            configure(overrides)
+        validate(compose(overrides))
+
+
+def test_tasks_without_an_arm_need_the_papers_recipe_and_say_so_by_the_first_setting_that_does_not_fit():
+    pytest.importorskip("vmas", reason="VMAS is an optional extra: pip install 'softgm-bench[vmas]'")
+    vmas = ("task=vmas_balance", "algo=mappo", "model=vector_mlp")
+    assert refusal(*vmas).startswith("algo.actor.persistence is 0.5: task=vmas_balance does not show")
+    assert configure([*vmas, "recipe=paper"]).experiment.train_horizon == 200

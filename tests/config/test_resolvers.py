@@ -1,0 +1,44 @@
+"""Values that depend on what was chosen elsewhere."""
+
+from omegaconf import OmegaConf
+
+from softgm_bench.config import compose_untyped, resolvers
+
+resolvers.register()
+
+
+def resolved(value, **settings):
+    return OmegaConf.create({"value": value, **settings}).value
+
+
+def test_a_value_depends_on_the_recipe():
+    for recipe, expected in (("tuned", 0.95), ("paper", 0.99)):
+        assert resolved("${tuned_or_paper:0.95, 0.99}", recipe=recipe) == expected
+
+
+def test_lists_groups_and_null_can_be_chosen_as_well():
+    value = "${tuned_or_paper:${first:null, [256, 256]}, {hidden:3}}"
+    assert resolved(value, recipe="tuned") == [256, 256]
+    assert resolved(value, recipe="paper") == {"hidden": 3}
+    assert resolved("${tuned_or_paper:null, 1}", recipe="tuned") is None
+
+
+def test_a_value_depends_on_whether_the_algorithm_has_a_replay():
+    assert resolved("${on_or_off_policy:1, 2}", algo={"name": "mine"}) == 1
+    assert resolved("${on_or_off_policy:1, 2}", algo={"name": "mine", "replay_capacity": 5}) == 2
+
+
+def test_a_value_depends_on_whether_the_experiment_is_a_smoke_run():
+    assert resolved("${in_smoke:1, 2}", experiment={"name": "smoke"}) == 1
+    assert resolved("${in_smoke:1, 2}", experiment={"total_frames": 7}) == 2
+
+
+def test_the_first_value_that_is_not_null():
+    assert resolved("${first:${oc.select:task.train_horizon}, 7}", task={}) == 7
+    assert resolved("${first:${oc.select:task.train_horizon}, 7}", task={"train_horizon": 3}) == 3
+    assert resolved("${first:null, null}") is None
+
+
+def test_the_command_line_replaces_the_choice():
+    assert compose_untyped(["algo.gamma=0.5", "recipe=paper"]).algo.gamma == 0.5
+    assert compose_untyped(["algo.critic.mlp=null"]).algo.critic.mlp is None

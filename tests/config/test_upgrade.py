@@ -1,0 +1,83 @@
+"""Settings of earlier versions are still read."""
+
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+from softgm_bench.config import compose, plain, typed
+from softgm_bench.config.upgrade import NEUTRAL, upgraded
+from softgm_bench.episodes import policy
+
+EXPERIMENTS = Path(__file__).parents[2] / "experiments"
+RUNS = sorted(EXPERIMENTS.rglob("config.yaml"))
+POLICIES = sorted((EXPERIMENTS / "policies").glob("*.pt"))
+
+
+def relative(path):
+    return str(path.relative_to(EXPERIMENTS))
+
+
+def assert_holds(values, written):
+    """Every value that was written down has stayed."""
+    for key, value in written.items():
+        if isinstance(value, dict):
+            assert_holds(values[key], value)
+        else:
+            assert (list(values[key]) if isinstance(values[key], tuple) else values[key]) == value, key
+
+
+@pytest.mark.parametrize("path", RUNS, ids=relative)
+def test_the_settings_of_every_committed_run_are_read_and_none_is_changed(path):
+    written = OmegaConf.load(path)
+    config = typed(written)
+    assert_holds(plain(config), OmegaConf.to_container(written))
+    assert (config.recipe, config.experiment.name) == ("", "")
+    assert config.label == path.parent.parent.name
+    assert typed(OmegaConf.create(plain(config))) == config
+
+
+@pytest.mark.parametrize("path", POLICIES, ids=relative)
+def test_every_committed_policy_is_loaded(path):
+    assert path.stem == f"{policy.load(path).config.task.name}_{policy.load(path).label}"
+
+
+def before(*overrides):
+    """Settings as they were written before recipes and experiments had names."""
+    values = plain(compose(list(overrides)))
+    for key in NEUTRAL:
+        group, _, name = key.rpartition(".")
+        del (values[group] if group else values)[name]
+    return values
+
+
+def test_keys_that_there_were_not_have_values_that_change_nothing():
+    config = typed(OmegaConf.create(before("task=wall")))
+    assert (config.recipe, config.experiment.name, config.resume) == ("", "", False)
+    assert (config.task.train_horizon, config.task.hidden_scene) == (None, False)
+    assert config.experiment.train_horizon == 200
+    assert config.task.curriculum.enabled is config.algo.critic.asymmetric is True
+
+
+@pytest.mark.parametrize("name", ["softgm_no_stage1", "softgm_no_stage2"])
+def test_an_ablation_that_was_an_algorithm_is_a_model_with_the_same_label(name):
+    today = compose(["task=wall", f"model={name}"])
+    values = before("task=wall", f"model={name}")
+    values["algo"]["name"], values["model"]["name"] = name, "softgm"
+
+    config = typed(OmegaConf.create(values))
+
+    assert (config.algo, config.model, config.label) == (today.algo, today.model, name)
+    assert config.run_dir == today.run_dir == f"outputs/wall/{name}/seed0"
+
+
+def test_settings_of_today_are_left_as_they_are():
+    values = plain(compose([]))
+    assert upgraded(values) == values
+    assert upgraded({}) == {}
+
+
+def test_runs_from_before_there_were_perturbations_had_none():
+    values = plain(compose([]))
+    del values["perturbation"]
+    assert typed(OmegaConf.create(values)) == compose([])
