@@ -1,13 +1,19 @@
-"""Choice of the rod's implementation by name."""
+"""The rod's implementations by name: what each one is for, and building one.
 
-from typing import Protocol
+A new backend is its module, with a class that does what ``Backend`` says, and a line in ``_REGISTRY``. The classes are
+imported when one is built; nothing else here needs torch, whose import takes seconds, or a CUDA compiler.
+"""
 
-from torch import Tensor
+from __future__ import annotations
 
-from softgm_bench.rod.parameters import RodParameters
-from softgm_bench.rod.state import Cylinders, RodState
+from importlib import import_module
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
-BACKENDS = ("numba", "torch", "cuda")
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from softgm_bench.rod.parameters import RodParameters
+    from softgm_bench.rod.state import Cylinders, RodState
 
 
 class Backend(Protocol):
@@ -28,22 +34,73 @@ class Backend(Protocol):
         ...
 
 
+class _Registered(NamedTuple):
+    """One backend's declaration of itself.
+
+    Attributes:
+        module: path of the module that holds its class.
+        factory: name of the class, which takes ``RodParameters``.
+        device_types: torch's names of the device types on which it runs.
+        default_on: those of them on which it is the one to take where nobody chose.
+    """
+
+    module: str
+    factory: str
+    device_types: tuple[str, ...]
+    default_on: tuple[str, ...] = ()
+
+
+_REGISTRY = {
+    "numba": _Registered("softgm_bench.rod.numba_backend", "NumbaBackend", ("cpu",), default_on=("cpu",)),
+    "torch": _Registered("softgm_bench.rod.torch_backend", "TorchBackend", ("cpu", "cuda")),
+    "cuda": _Registered("softgm_bench.rod.cuda_backend", "CudaBackend", ("cuda",), default_on=("cuda",)),
+}
+
+BACKENDS = tuple(_REGISTRY)
+
+
 def make_backend(name: str, parameters: RodParameters) -> Backend:
-    """Build ``numba`` (fused, CPU), ``cuda`` (fused, GPU) or ``torch`` (reference, any device, differentiable).
+    """Build a backend for one arm: ``numba`` and ``cuda`` are fused kernels, ``torch`` is the differentiable reference.
 
     Raises:
-        ValueError: for another name.
+        ValueError: for a name that is not in ``BACKENDS``, or if the backend cannot hold such a rod.
     """
-    if name == "numba":
-        from softgm_bench.rod.numba_backend import NumbaBackend
+    registered = _registered(name)
+    backend: Backend = getattr(import_module(registered.module), registered.factory)(parameters)
+    return backend
 
-        return NumbaBackend(parameters)
-    if name == "torch":
-        from softgm_bench.rod.torch_backend import TorchBackend
 
-        return TorchBackend(parameters)
-    if name == "cuda":
-        from softgm_bench.rod.cuda_backend import CudaBackend
+def default_backend(device_type: str) -> str:
+    """Name the backend to take on a device type (``cpu``, ``cuda``) where nobody chose one: its fused kernel.
 
-        return CudaBackend(parameters)
-    raise ValueError(f"backend is {name!r}: choose one of {', '.join(BACKENDS)}")
+    Raises:
+        ValueError: if no backend is the default there.
+    """
+    for name, registered in _REGISTRY.items():
+        if device_type in registered.default_on:
+            return name
+    known = [kind for registered in _REGISTRY.values() for kind in registered.default_on]
+    raise ValueError(f"device={device_type}: no backend is made for it; choose device={' or '.join(known)}")
+
+
+def check_backend(name: str, device_type: str) -> None:
+    """Refuse a backend that does not run on a device type (``cpu``, ``cuda``).
+
+    Raises:
+        ValueError: for a name that is not in ``BACKENDS``, or saying which device and which backends would do.
+    """
+    registered = _registered(name)
+    if device_type in registered.device_types:
+        return
+    others = [other for other, candidate in _REGISTRY.items() if device_type in candidate.device_types]
+    instead = f", or backend={' or '.join(others)}" if others else ""
+    raise ValueError(
+        f"backend={name} does not run on device={device_type}: "
+        f"choose device={' or '.join(registered.device_types)}{instead}"
+    )
+
+
+def _registered(name: str) -> _Registered:
+    if name not in _REGISTRY:
+        raise ValueError(f"backend is {name!r}: choose one of {', '.join(BACKENDS)}")
+    return _REGISTRY[name]
