@@ -83,7 +83,8 @@ def check_by_building(config: Config) -> None:
             _refuse_memory(config)
         if env.sizes.layout == VECTOR and getattr(getattr(config.algo, "critic", None), "mlp", None) is not None:
             raise ValueError(
-                f"algo.critic.mlp: it reads the arm's observation, which task={config.task.name} has not; it must be null"
+                "algo.critic.mlp: it reads the arm's observation, "
+                f"which task={config.task.name} has not; it must be null"
             )
         encoder = build_encoder(config.model, env.sizes)
     except ValueError as error:

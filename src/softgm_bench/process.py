@@ -6,9 +6,9 @@ Entry points call ``prepare`` first; importing the package sets nothing.
 import os
 
 SETTINGS = {
-    # Idle OpenMP threads of torch spin for milliseconds by default, which slows processes that share cores (a sweep, an
-    # evaluation beside a training) tens of times; sleeping at once halves the speed of a process that is alone. Spinning
-    # for microseconds loses neither.
+    # Idle OpenMP threads of torch spin for milliseconds by default, which slows processes that share cores (a sweep,
+    # an evaluation beside a training) tens of times; sleeping at once halves the speed of a process that is alone.
+    # Spinning for microseconds loses neither.
     "GOMP_SPINCOUNT": "2000",
     # oneDNN multiplies float32 matrices twice as fast as MKL on AMD's cores (``runs.machine`` chooses it), through a
     # setting that would let it round them to bfloat16 where the CPU has instructions for that; this forbids it.

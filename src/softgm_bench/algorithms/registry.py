@@ -13,9 +13,9 @@ class Algorithm(Protocol):
     """What the experiment's loop knows of an algorithm.
 
     Attributes:
-        policy: reads ``entries.OBSERVATION`` (and ``entries.PRIVILEGED`` as an oracle), writes ``entries.ACTION``; explores
-            under ``ExplorationType.RANDOM`` and is deterministic under ``ExplorationType.DETERMINISTIC``. The collector
-            and the evaluation call it.
+        policy: reads ``entries.OBSERVATION`` (and ``entries.PRIVILEGED`` as an oracle), writes ``entries.ACTION``;
+            explores under ``ExplorationType.RANDOM`` and is deterministic under ``ExplorationType.DETERMINISTIC``. The
+            collector and the evaluation call it.
     """
 
     policy: TensorDictModuleBase

@@ -5,6 +5,7 @@ import re
 
 from softgm_bench.config.schema import DTYPES, OBSERVATIONS, Config
 from softgm_bench.errors import UserError
+from softgm_bench.rod.backend import BACKENDS, check_backend
 
 
 def validate(config: Config) -> None:
@@ -47,8 +48,6 @@ def available_threads() -> int:
 
 
 def _validate_machine(config: Config) -> None:
-    from softgm_bench.rod.backend import BACKENDS
-
     cores = available_threads()
     if config.threads is not None and not 1 <= config.threads <= cores:
         raise UserError(f"threads={config.threads}: choose 1 to {cores}, the cores of this machine, or null")
@@ -56,11 +55,24 @@ def _validate_machine(config: Config) -> None:
         raise UserError(f"backend={config.backend}: choose one of {', '.join(BACKENDS)}, or null")
     if config.dtype not in DTYPES:
         raise UserError(f"dtype={config.dtype}: choose one of {', '.join(DTYPES)}")
-    if config.device == "cpu" and config.backend == "cuda":
-        raise UserError("backend=cuda runs on a CUDA device: add device=cuda, or choose backend=numba")
-    if config.device != "cpu" and config.backend == "numba":
-        raise UserError(f"device={config.device}: backend=numba runs on the CPU; choose backend=cuda, torch or null")
+    kind = device_type(config.device)
+    if config.backend is not None:
+        try:
+            check_backend(config.backend, kind)
+        except ValueError as error:
+            raise UserError(str(error)) from error
     validate_device(config.device)
+
+
+def device_type(device: str) -> str:
+    """Give ``cpu`` or ``cuda``.
+
+    Raises:
+        UserError: the name is no device's.
+    """
+    if not re.fullmatch(r"cpu|cuda(:\d+)?", device):
+        raise UserError(f"device={device}: choose cpu, cuda or cuda:<index>")
+    return device.partition(":")[0]
 
 
 def validate_device(device: str) -> None:
@@ -69,10 +81,9 @@ def validate_device(device: str) -> None:
     Raises:
         UserError: saying what there is.
     """
-    import torch
+    if device_type(device) == "cpu":
+        return
+    import torch  # late: it takes seconds
 
-    cuda = re.fullmatch(r"cpu|cuda(?::(\d+))?", device)
-    if cuda is None:
-        raise UserError(f"device={device}: choose cpu, cuda or cuda:<index>")
-    if device != "cpu" and int(cuda.group(1) or 0) >= torch.cuda.device_count():
+    if int(device.partition(":")[2] or 0) >= torch.cuda.device_count():
         raise UserError(f"device={device}: this machine has {torch.cuda.device_count()} CUDA devices")

@@ -8,7 +8,7 @@ from softgm_bench.envs.interface import Kind, Settings, register_kind
 from softgm_bench.envs.perturbation import PerturbationConfig
 from softgm_bench.envs.soft_arm import SoftArmEnv, sizes_of
 from softgm_bench.envs.tasks import TASK_CONFIGS, TaskConfig, make_task
-from softgm_bench.rod.backend import make_backend
+from softgm_bench.rod.backend import default_backend, make_backend
 from softgm_bench.rod.parameters import RodParameters
 
 
@@ -30,8 +30,7 @@ def make_env(
     ``curriculum``: for training alone, follow the task's if it is enabled; otherwise all scenes are the task's own.
     ``backend`` is a name that ``make_backend`` knows; None: the fused kernel of the device.
     """
-    fused = "numba" if torch.device(device).type == "cpu" else "cuda"
-    rod = make_backend(backend or fused, rod_parameters)
+    rod = make_backend(backend or default_backend(torch.device(device).type), rod_parameters)
     if not curriculum:
         task_config = replace(task_config, curriculum=replace(task_config.curriculum, enabled=False))
     return SoftArmEnv(make_task(task_config), rod, num_envs, seed, horizon, device, dtype, stagger, perturbation)

@@ -1,8 +1,8 @@
 """The arm's simulation: its whole mutable state, and the control step that moves it.
 
-``Simulation`` holds everything that changes, so that a checkpoint is a copy of it (and of the generators). ``Simulator``
-moves it; ``soft_arm`` turns it into TorchRL's environment. On a device other than the CPU nothing here waits for the
-device: see ``softgm_bench.rod.sync``.
+``Simulation`` holds everything that changes, so that a checkpoint is a copy of it (and of the generators).
+``Simulator`` moves it; ``soft_arm`` turns it into TorchRL's environment. On a device other than the CPU nothing here
+waits for the device: see ``softgm_bench.rod.sync``.
 """
 
 from typing import NamedTuple

@@ -11,9 +11,11 @@ from tensordict.nn import TensorDictModuleBase
 
 from softgm_bench.assembly import build_policy, check
 from softgm_bench.config import Config, changed, plain, typed, validate_device
+from softgm_bench.config.checks import device_type
 from softgm_bench.config.explain import USER_ERRORS
 from softgm_bench.envs import Sizes, kind_of
 from softgm_bench.errors import UserError
+from softgm_bench.rod.backend import runs_on
 from softgm_bench.storage import archive
 from softgm_bench.storage.files import write_where_asked
 from softgm_bench.storage.run_folder import RunFolder
@@ -110,9 +112,9 @@ def _file(path: Path) -> Path:
 
 
 def _on(config: Config, device: str) -> Config:
-    """Put the configuration on a device, where the other device's kernel is replaced by its own."""
-    foreign = "cuda" if device == "cpu" else "numba"
-    return replace(config, device=device, backend=None if config.backend == foreign else config.backend)
+    """Put the configuration on a device, where a kernel that does not run there is replaced by the device's own."""
+    stays = config.backend is None or runs_on(config.backend, device_type(device))
+    return replace(config, device=device, backend=config.backend if stays else None)
 
 
 def _actor_of(loss: Mapping[str, Any], policy: TensorDictModuleBase) -> dict[str, Any]:

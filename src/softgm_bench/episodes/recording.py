@@ -20,6 +20,7 @@ from softgm_bench.episodes.evaluation import act, evaluation_seed
 from softgm_bench.episodes.policy import TrainedPolicy
 from softgm_bench.episodes.trajectory import CYLINDER_FIELDS, ROD, Array, Trajectory
 from softgm_bench.errors import UserError
+from softgm_bench.rod.backend import default_backend, runs_on
 from softgm_bench.storage.versions import versions
 
 OBSERVED = (*entries.OBSERVATION, entries.PRIVILEGED)
@@ -54,7 +55,7 @@ def record(
     episodes = episode + 1 if episodes is None else episodes
     _check(trained, seed, episode, episodes, horizon)
     config = trained.config
-    backend = "torch" if config.backend == "torch" else "numba"
+    backend = config.backend if config.backend and runs_on(config.backend, "cpu") else default_backend("cpu")
     own = evaluation_seed(seed)
     env = cast(SoftArmEnv, build_env(replace(config, device="cpu", backend=backend), episodes, own, horizon))
     exploration = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM

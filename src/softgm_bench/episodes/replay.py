@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from softgm_bench.config import UserError
 from softgm_bench.episodes.trajectory import ROD, Array, Trajectory
+from softgm_bench.rod import backend as rod_backend
 from softgm_bench.rod.actuation import Actuation
-from softgm_bench.rod.backend import make_backend
 from softgm_bench.rod.divergence import diverged
 from softgm_bench.rod.parameters import rod_constants
 from softgm_bench.rod.state import Cylinders, RodState
 
-BACKENDS = ("numba", "torch", "pyelastica")
+BACKENDS = (*(name for name in rod_backend.BACKENDS if rod_backend.runs_on(name, "cpu")), "pyelastica")
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ def _outcome(position: Array, target: Array, radius: float) -> dict[str, Any]:
 
 def _ours(trajectory: Trajectory, name: str) -> Replay:
     parameters, dtype = trajectory.rod, torch.from_numpy(trajectory.position).dtype
-    backend, couple, force = make_backend(name, parameters), _couple(trajectory, dtype), _force(trajectory)
+    backend, couple, force = rod_backend.make_backend(name, parameters), _couple(trajectory, dtype), _force(trajectory)
     cylinders = _cylinders(trajectory, dtype)
     task = trajectory.config["task"]
     rest_length = torch.as_tensor(rod_constants(parameters).rest_length, dtype=dtype)

@@ -31,7 +31,7 @@ class ActionValueConfig:
     Attributes:
         widths: hidden layers, each followed by tanh.
         mlp: the critic's encoder is this MLP, whatever the actor's; None: the same model as the actor's.
-        asymmetric: the head reads ``entries.PRIVILEGED`` too. Only training has a critic, so execution does not need it.
+        asymmetric: the head reads ``entries.PRIVILEGED`` too. Only training has a critic; execution does not need it.
     """
 
     widths: list[int]
@@ -40,7 +40,7 @@ class ActionValueConfig:
 
 
 class AgentActionValue(TensorDictModuleBase):
-    """Reads ``entries.OBSERVATION`` and ``entries.ACTION``, writes a value per agent in ``ACTION_VALUE`` ``(..., N, 1)``."""
+    """Reads ``entries.OBSERVATION`` and ``entries.ACTION``, writes values ``ACTION_VALUE`` ``(..., N, 1)``."""
 
     def __init__(self, encoder: Encoder, actions: int, config: ActionValueConfig, n_privileged: int = 0) -> None:
         """Put f_Q on an encoder; ``actions`` is A, the numbers in one agent's action."""
@@ -59,7 +59,7 @@ class AgentActionValue(TensorDictModuleBase):
 
 
 class TeamActionValue(TensorDictModuleBase):
-    """Reads ``entries.OBSERVATION`` and ``entries.ACTION``, writes its value N times in ``ACTION_VALUE`` ``(..., N, 1)``."""
+    """Reads ``entries.OBSERVATION`` and ``entries.ACTION``, writes a value N times ``(..., N, 1)``."""
 
     def __init__(self, encoder: TeamEncoder, n_agents: int, config: ActionValueConfig, n_privileged: int = 0) -> None:
         """Put f_Q on an encoder whose further inputs are the actions, then the privileged channels."""

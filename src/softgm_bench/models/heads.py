@@ -1,8 +1,8 @@
 """From embeddings to TorchRL actors and critics; the same heads for every encoder.
 
 Each network reads the observation from the tensordict itself: an encoder and its head cost one module call. A head
-that is built with ``n_privileged`` above 0 reads that many channels of ``entries.PRIVILEGED`` too: an asymmetric critic's
-or an oracle's. No encoder ever does.
+that is built with ``n_privileged`` above 0 reads that many channels of ``entries.PRIVILEGED`` too: an asymmetric
+critic's or an oracle's. No encoder ever does.
 """
 
 import itertools
@@ -84,7 +84,7 @@ class ValueConfig:
             ``concat``: all agents side by side, MAPPO's, in the form that the model gives it. An independent critic
             pools nothing.
         mlp: the critic's encoder is this MLP, whatever the actor's; None: the same model as the actor's.
-        asymmetric: the head reads ``entries.PRIVILEGED`` too. Only training has a critic, so execution does not need it.
+        asymmetric: the head reads ``entries.PRIVILEGED`` too. Only training has a critic; execution does not need it.
     """
 
     widths: list[int]
@@ -227,7 +227,9 @@ class AgentValue(TensorDictModuleBase):
 def build_actor(
     encoder_config: Any, sizes: Sizes, config: ActorConfig, n_privileged: int = 0
 ) -> ProbabilisticTensorDictSequential:
-    """The squashed Gaussian actor: reads ``entries.OBSERVATION``, writes ``entries.ACTION`` and ``entries.LOG_PROB`` (B, N).
+    """Build the squashed Gaussian actor, which reads ``entries.OBSERVATION``.
+
+    It writes ``entries.ACTION`` and ``entries.LOG_PROB`` (B, N).
 
     It samples unless ``set_exploration_type`` says otherwise. tensordict's module is used and not TorchRL's
     ``ProbabilisticActor``: the latter (0.14.1) stores the log-probability of the pre-tanh sample, which differs from

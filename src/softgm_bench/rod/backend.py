@@ -83,20 +83,28 @@ def default_backend(device_type: str) -> str:
     raise ValueError(f"device={device_type}: no backend is made for it; choose device={' or '.join(known)}")
 
 
+def runs_on(name: str, device_type: str) -> bool:
+    """Tell whether a backend runs on a device type (``cpu``, ``cuda``).
+
+    Raises:
+        ValueError: for a name that is not in ``BACKENDS``.
+    """
+    return device_type in _registered(name).device_types
+
+
 def check_backend(name: str, device_type: str) -> None:
     """Refuse a backend that does not run on a device type (``cpu``, ``cuda``).
 
     Raises:
         ValueError: for a name that is not in ``BACKENDS``, or saying which device and which backends would do.
     """
-    registered = _registered(name)
-    if device_type in registered.device_types:
+    if runs_on(name, device_type):
         return
-    others = [other for other, candidate in _REGISTRY.items() if device_type in candidate.device_types]
+    others = [other for other in BACKENDS if runs_on(other, device_type)]
     instead = f", or backend={' or '.join(others)}" if others else ""
     raise ValueError(
         f"backend={name} does not run on device={device_type}: "
-        f"choose device={' or '.join(registered.device_types)}{instead}"
+        f"choose device={' or '.join(_registered(name).device_types)}{instead}"
     )
 
 

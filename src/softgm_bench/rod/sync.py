@@ -1,8 +1,8 @@
 """Where values may steer the program, and where reading one would make the processors wait for each other.
 
 On a CPU reading a tensor's values is free, so compiled loops skip what is not there. On any other device reading one
-stops both processors until all queued work is done; there the same results come from shapes that do not depend on values.
-Callers ask through this module (``sync.is_free``), so that a test can send the CPU down the other devices' way.
+stops both processors until all queued work is done; there the same results come from shapes that do not depend on
+values. Callers ask through this module (``sync.is_free``), so that a test can send the CPU down the other devices' way.
 """
 
 import torch

@@ -89,7 +89,7 @@ class EpisodeTracker:
 
 
 def step_metrics(batch: TensorDictBase) -> dict[str, float]:
-    """Reduce what every step tells over a batch ``(num_envs, steps)``, as the table of entries asks; else the reward."""
+    """Reduce a batch ``(num_envs, steps)`` to numbers, as the table of entries asks; without any, to the reward."""
     after = batch["next"]
     told = after.keys(include_nested=True)
     columns = [column for column in entries.ITERATION_COLUMNS if column.key in told]

@@ -1,4 +1,4 @@
-"""Whether torch's function transforms (vmap and the like) are at work; torch 2.13 tells it by private functions only."""
+"""Whether torch's function transforms (vmap and the like) are at work, which torch 2.13 tells by private functions."""
 
 import torch
 from torch import Tensor
