@@ -82,7 +82,7 @@ algo: {gamma: 0.5, epochs: 2}
 task: {horizon: 7}
 model: {residual: true}
 experiment: {num_envs: 3}
-perturbation: {tip_force: 1.0, steps: 1}
+perturbation: {tip_force: 1.0, steps: 1, name: mine}
 dtype: float32
 """
     monkeypatch.setenv(plugins.VARIABLE, recipe_file(tmp_path, text))

@@ -102,9 +102,9 @@ def _refuse_other_settings(config: Config, folder: RunFolder) -> None:
         held = typed(cast(DictConfig, OmegaConf.create(folder.config.read_text())))
     except (ValueError, TypeError, AttributeError, YAMLError, *USER_ERRORS) as error:
         raise UserError(f"{folder.config}: missing or of another version; {ANEW}") from error
-    now, then = config.experiment.total_frames, held.experiment.total_frames
-    if now < then:
-        raise UserError(f"{TOTAL_FRAMES}={now}: the run has {then}; it can only grow")
+    frames, held_frames = config.experiment.total_frames, held.experiment.total_frames
+    if frames < held_frames:
+        raise UserError(f"{TOTAL_FRAMES}={frames}: the run has {held_frames}; it can only grow")
     free = [TOTAL_FRAMES]
     if getattr(config.algo, "lr_schedule", "") == "constant":
         free.append("algo.lr_schedule_frames")  # follows total_frames, and nobody reads it
