@@ -10,29 +10,30 @@ import hashlib
 import json
 import math
 import re
+import zlib
 from html import escape
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
 from softgm_bench.experiment.run_folder import write_where_asked
 from softgm_bench.experiment.trajectory import Trajectory
 from softgm_bench.render import style
-from softgm_bench.render.camera import FIELD_OF_VIEW, MANY, default_direction
+from softgm_bench.render.camera import FIELD_OF_VIEW, default_direction
+from softgm_bench.render.scene import Stage
 
 VIEWER = Path(__file__).with_name("viewer")
 SCRIPTS = (
-    "data.js",
-    "math.js",
+    "three/three.min.js",
+    "episode.js",
     "colours.js",
-    "camera.js",
-    "rod.js",
-    "marks.js",
-    "shaders.js",
-    "gl.js",
-    "flat.js",
+    "view.js",
+    "arm.js",
+    "edges.js",
+    "scene.js",
     "plots.js",
     "matrix.js",
     "main.js",
@@ -108,7 +109,8 @@ def payload(trajectory: Trajectory) -> dict[str, Any]:
     1/255 of their range, d1's components to 1/127, attention weights to 1/255.
     """
     task, rod = trajectory.config["task"], trajectory.config["rod"]
-    slots = _slots(trajectory)
+    slots, stage = _slots(trajectory), Stage(trajectory)
+    extent = stage.extent()
     packed = {
         "position": _rounded(trajectory.position.transpose(0, 2, 1), np.uint16),
         "normal": _array(np.rint(127.0 * trajectory.director[:, 0].transpose(0, 2, 1)), np.int8, scale=1.0 / 127.0),
@@ -136,7 +138,9 @@ def payload(trajectory: Trajectory) -> dict[str, Any]:
         "diverged": bool(trajectory.diverged),
         "target": _numbers(trajectory.target),
         "cylinders": _cylinders(trajectory.cylinders),
-        "wall": len(trajectory.cylinders["length"]) >= MANY,
+        "wall": stage.wall,
+        "floor": round(stage.floor, 6),
+        "extent": [_numbers(extent[corner]) for corner in ConvexHull(extent).vertices],
         "slots": slots,
         "terms": list(trajectory.reward_terms),
         "colours": COLOURS,
@@ -206,7 +210,7 @@ def _array(values: NDArray, dtype: type, *, scale: float = 1.0, offset: float = 
         "shape": list(stored.shape),
         "scale": scale,
         "offset": offset,
-        "data": base64.b64encode(stored.tobytes()).decode(),
+        "data": base64.b64encode(zlib.compress(stored.tobytes(), 9)).decode(),
     }
 
 

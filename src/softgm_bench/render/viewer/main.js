@@ -2,26 +2,24 @@
 
 const SPEEDS = [0.05, 0.1, 0.25, 0.5, 1, 2, 4, 8, 16];
 
-function main() {
+async function main() {
   const by = (id) => document.getElementById(id);
-  const episode = readEpisode();
+  const episode = await readEpisode();
   readPaint(episode.colours);
-  const bounds = sceneBounds(episode);
   const canvas = by("scene");
-  const camera = new Camera(episode.camera, bounds.points);
+  const view = new View(canvas, episode, changed);
   const show = { edges: true, actions: true, path: true, labels: true, clear: episode.wall };
   const state = { time: 0, playing: false, speed: 1, theme: readTheme(), choice: { stage: null, layer: null, head: null }, show };
   const hash = new URLSearchParams(location.hash.slice(1));
-  let renderer = chooseRenderer(canvas, episode, bounds, hash.get("renderer") === "2d");
+  const scene = hash.get("renderer") === "2d" ? null : makeScene(canvas, episode, view);
+  by("notice").hidden = scene !== null;
   let waiting = false;
   let before = null;
   let ratio = 1;
 
   function changed() {
-    if (!waiting) {
-      waiting = true;
-      requestAnimationFrame(tick);
-    }
+    if (!waiting) requestAnimationFrame(tick);
+    waiting = true;
   }
 
   function tick(now) {
@@ -37,26 +35,25 @@ function main() {
   }
 
   function draw() {
-    const rod = rodAt(episode, state.time);
-    const frame = {
-      rod,
-      reached: episode.success && state.time >= episode.steps,
-      solids: solidsAt(episode, rod, state.time, bounds, state.theme, show),
-      path: show.path ? pathAt(episode, state.time) : [],
-      edges: show.edges ? edgesAt(episode, rod, state.time, state.theme, state.choice, camera.out) : [],
-    };
-    renderer.draw(frame, camera, state.theme, ratio);
-    drawLabels(by("overlay"), episode, rod, camera, state, ratio);
+    const { theme, time } = state;
+    const rod = rodAt(episode, time);
+    const out = view.camera.position.clone().sub(view.controls.target).normalize();
+    const path = show.path ? pathAt(episode, time) : [];
+    const edges = show.edges ? edgesAt(episode, rod, time, theme, state.choice, out) : [];
+    const context = by("overlay").getContext("2d");
+    context.setTransform(ratio, 0, 0, ratio, 0, 0);
+    context.clearRect(0, 0, view.width, view.height);
+    if (scene) scene.draw(time, rod, [...path, ...edges], theme, show, ratio);
+    else drawFlat(context, episode, rod, time, [...path, ...edges], view);
+    if (show.labels) drawLabels(context, episode, rod, view);
     readOuts(episode, state);
     plots.draw();
     matrix.draw();
   }
 
   function seek(time) {
-    setPlaying(false);
     state.time = clamp(time, 0, episode.steps);
-    speak(episode, state);
-    changed();
+    setPlaying(false);
   }
 
   function setPlaying(playing) {
@@ -71,16 +68,13 @@ function main() {
 
   function resize() {
     ratio = Math.min(window.devicePixelRatio || 1, 2);
-    const [width, height] = [canvas.clientWidth, canvas.clientHeight];
-    for (const one of [canvas, by("overlay")]) {
-      one.width = Math.max(1, Math.round(width * ratio));
-      one.height = Math.max(1, Math.round(height * ratio));
-    }
+    const [width, height] = [Math.max(1, canvas.clientWidth), Math.max(1, canvas.clientHeight)];
+    Object.assign(by("overlay"), { width: Math.round(width * ratio), height: Math.round(height * ratio) });
     const header = document.querySelector("header").offsetHeight;
-    camera.resize(width, height, [Math.min(header + 16, 0.3 * height), 20, 34, 20]);
+    view.resize(width, height, [Math.min(header + 16, 0.3 * height), 20, 34, 20]);
     plots.resize();
     matrix.resize();
-    changed();
+    draw();
   }
 
   const plots = makePlots(episode, state, seek);
@@ -98,19 +92,9 @@ function main() {
     });
   }
   const views = { home: [], front: [Math.PI, 0.12], side: [-Math.PI / 2, 0.12], top: [-Math.PI / 2, 1.5] };
-  for (const [name, angles] of Object.entries(views)) {
-    by(`view-${name}`).addEventListener("click", () => {
-      camera.reset(...angles);
-      changed();
-    });
-  }
-  listenForCamera(canvas, camera, changed);
-  listenForKeys({ episode, state, camera, seek, setPlaying, changed });
-  canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
-  canvas.addEventListener("webglcontextrestored", () => {
-    renderer = new GlRenderer(canvas, episode, bounds);
-    changed();
-  });
+  for (const [name, angles] of Object.entries(views)) by(`view-${name}`).addEventListener("click", () => view.reset(...angles));
+  listenForKeys({ episode, state, view, seek, setPlaying });
+  canvas.addEventListener("webglcontextrestored", changed);
   new ResizeObserver(resize).observe(document.querySelector(".stage"));
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
     state.theme = readTheme();
@@ -123,18 +107,10 @@ function main() {
   setPlaying(!still);
 }
 
-function chooseRenderer(canvas, episode, bounds, flat) {
-  if (!flat) {
-    try {
-      return new GlRenderer(canvas, episode, bounds);
-    } catch (error) {
-      console.warn(error.message);
-    }
-  }
-  const notice = document.getElementById("notice");
-  notice.hidden = false;
-  notice.textContent = "Simple drawing: this browser offers no WebGL 2 here.";
-  return new FlatRenderer(canvas, episode);
+// Null where this browser has no WebGL 2.
+function makeScene(canvas, episode, view) {
+  if (!document.createElement("canvas").getContext("webgl2")) return null;
+  return new ArmScene(canvas, episode, view);
 }
 
 function chooseSpeeds(select, episode, state) {
@@ -146,23 +122,16 @@ function chooseSpeeds(select, episode, state) {
   select.addEventListener("change", () => (state.speed = Number(select.value)));
 }
 
-function listenForKeys({ episode, state, camera, seek, setPlaying, changed }) {
-  const zoom = (factor) => {
-    camera.zoom(factor);
-    changed();
-  };
+function listenForKeys({ episode, state, view, seek, setPlaying }) {
   const actions = {
     ArrowRight: (size) => seek(Math.floor(state.time + 1e-6) + size),
     ArrowLeft: (size) => seek(Math.ceil(state.time - 1e-6) - size),
     Home: () => seek(0),
     End: () => seek(episode.steps),
-    r: () => {
-      camera.reset();
-      changed();
-    },
-    "+": () => zoom(0.87),
-    "=": () => zoom(0.87),
-    "-": () => zoom(1.15),
+    r: () => view.reset(),
+    "+": () => view.zoom(0.87),
+    "=": () => view.zoom(0.87),
+    "-": () => view.zoom(1.15),
   };
   document.addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
@@ -200,7 +169,6 @@ function describe(episode) {
 }
 
 const millimetres = (metres) => `${(1000 * metres).toFixed(0)} mm`;
-const minus = (text) => text.replace("-", "−");
 
 function readOuts(episode, state) {
   const by = (id) => document.getElementById(id);
@@ -225,28 +193,44 @@ function speak(episode, state) {
     `Step ${step} of ${episode.steps}: ${millimetres(episode.distance[step])} to the target, ${episode.touching[step]} nodes in contact.`;
 }
 
-function drawLabels(canvas, episode, rod, camera, state, ratio) {
-  const context = canvas.getContext("2d");
-  context.setTransform(1, 0, 0, 1, 0, 0);
-  context.clearRect(0, 0, canvas.width, canvas.height);
-  if (!state.show.labels) return;
-  context.setTransform(ratio, 0, 0, ratio, 0, 0);
-  context.font = "600 10.5px system-ui, sans-serif";
-  context.textAlign = "center";
-  context.textBaseline = "middle";
-  episode.agentNodes.forEach((node, agent) => {
-    const frame = frameAt(rod, node, episode.elements);
-    const [x, y, depth] = camera.project(frame.centre);
-    if (depth < NEAR) return;
-    const colour = agentColour(agent, episode.agents);
+// Without WebGL: thick strokes with round ends, the far ones first.
+function drawFlat(context, episode, rod, time, segments, view) {
+  const strokes = [];
+  const stroke = (start, end, colour, thick) => {
+    const [a, b] = [view.project(start), view.project(end)];
+    if (Math.min(a.metres, b.metres) > 0) strokes.push({ a, b, colour, width: thick(a.metres), far: a.metres + b.metres });
+  };
+  for (const { start, axis, length, radius } of episode.cylinders) {
+    stroke(start, along(start, axis, length), css(PAINT.column, 0.6), (metres) => (2 * radius) / metres);
+  }
+  for (const { centre, half, axis, radius, step } of episode.slots) {
+    if (step <= time) stroke(along(centre, axis, -half), along(centre, axis, half), css(PAINT.discovered, 0.5), (metres) => (2 * radius) / metres);
+  }
+  rod.slice(1).forEach((node, i) => {
+    const colour = mixed(gradient(PAINT.arm, i / episode.elements), PAINT.touch, 0.7 * node.contact);
+    stroke(rod[i].centre, node.centre, css(colour), (metres) => (2 * node.radius) / metres);
+  });
+  stroke(episode.target, episode.target, css(PAINT.target, 0.6), (metres) => (2 * episode.successRadius) / metres);
+  for (const { start, end, width } of segments) stroke(start.at, end.at, css(end.colour, end.alpha), () => width);
+  context.lineCap = "round";
+  for (const { a, b, colour, width } of strokes.sort((p, q) => q.far - p.far)) {
+    context.strokeStyle = colour;
+    context.lineWidth = width;
     context.beginPath();
-    context.arc(x, y, 8, 0, 2 * Math.PI);
-    context.fillStyle = "#ffffff";
-    context.fill();
-    context.lineWidth = 2;
-    context.strokeStyle = css(mixed(colour, [0, 0, 0], 0.15));
+    context.moveTo(a.x, a.y);
+    context.lineTo(b.x + 0.01, b.y);
     context.stroke();
-    context.fillStyle = "#1b2430";
+  }
+}
+
+function drawLabels(context, episode, rod, view) {
+  Object.assign(context, { font: "600 10.5px system-ui, sans-serif", textAlign: "center", textBaseline: "middle" });
+  const [white, ink] = [new Color("#ffffff"), new Color("#1b2430")];
+  episode.agentNodes.forEach((node, agent) => {
+    const { x, y, metres } = view.project(rod[node].centre);
+    if (metres <= 0) return;
+    disc(context, x, y, 8, white, mixed(agentColour(agent, episode.agents), ink, 0.2), 2);
+    context.fillStyle = css(ink);
     context.fillText(String(agent + 1), x, y + 0.5);
   });
 }

@@ -12,7 +12,7 @@ function makeMatrix(episode, state, changed) {
   by("attention").hidden = false;
   const options = (id, entries) => by(id).replaceChildren(...entries.map(([text, value]) => new Option(text, value)));
   const first = episode.attention[names[0]];
-  const numbered = (count, name) => Array.from({ length: count }, (_, k) => [`${name} ${k + 1}`, k]);
+  const numbered = (n, name) => count(n).map((k) => [`${name} ${k + 1}`, k]);
   options("a-stage", [...(names.length > 1 ? [["both", ""]] : []), ...names.map((name) => [STAGES[name], name])]);
   options("a-layer", [["mean", ""], ...numbered(first.layers, "layer")]);
   options("a-head", [["mean", ""], ...numbered(first.heads, "head")]);
@@ -78,9 +78,11 @@ function paintTables(context, width, height, tables, episode, theme) {
     context.fillStyle = css(theme.line, 0.45);
     context.fillRect(x, top, cell * t.columns, height - top);
     for (const [receiver, source, weight] of t.cells) {
-      context.fillStyle = css(mixed(theme.panel, colour, Math.sqrt(weight)));
       const inset = cell > 5 ? 0.5 : 0;
-      context.fillRect(x + cell * source + inset, top + rows * (agents - 1 - receiver) + 0.5, cell - 2 * inset, rows - 1);
+      for (const fill of [css(theme.panel), css(colour, Math.sqrt(weight))]) {
+        context.fillStyle = fill;
+        context.fillRect(x + cell * source + inset, top + rows * (agents - 1 - receiver) + 0.5, cell - 2 * inset, rows - 1);
+      }
     }
     x += cell * t.columns + gap;
   });
