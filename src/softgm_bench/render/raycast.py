@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from softgm_bench.render.camera import NEAR, Camera
+from softgm_bench.render.camera import CORNERS, NEAR, Camera
 from softgm_bench.render.geometry import MISS, hit_round_cone, jit
 from softgm_bench.render.grid import Grid, cell_of, make_grid
 from softgm_bench.render.shading import MARK, Drawing, lit_part, open_part, shade, texture_at
@@ -31,15 +31,7 @@ class View(NamedTuple):
 
 
 def render(drawing: Drawing, camera: Camera) -> NDArray[np.uint8]:
-    """Draw.
-
-    Args:
-        drawing: everything.
-        camera: outside of all round cones.
-
-    Returns:
-        sRGB image, ``(height, width, 3)``. The same arguments give the same image.
-    """
+    """An sRGB image ``(height, width, 3)``, always the same; the camera is outside of all round cones."""
     low, high = _on_screen(drawing.cone, camera)
     tiles = make_grid(low, high, TILE, ([0.0, 0.0, 0.0], [camera.width - 1.0, camera.height - 1.0, 0.0]))
     view = View(camera.position, camera.basis, camera.focal, camera.width, camera.height, tiles)
@@ -49,10 +41,9 @@ def render(drawing: Drawing, camera: Camera) -> NDArray[np.uint8]:
 def _on_screen(cone: NDArray[np.float64], camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Boxes in pixels, ``(P, 3)`` each, of the third coordinate 0, around the round cones' pictures.
 
-    The hull of two spheres is inside of the hull of two boxes around them, whose corners are looked at.
+    The hull of two spheres is inside of the hull of two boxes around them, whose corners are projected.
     """
-    corner = np.stack(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [-1.0, 1.0], indexing="ij"), axis=-1).reshape(8, 3)
-    offset = corner @ camera.basis  # boxes along the camera's axes
+    offset = CORNERS @ camera.basis  # boxes along the camera's axes
     ends = cone.reshape(-1, 2, 4)
     points = ends[:, :, None, :3] + ends[:, :, None, 3:] * offset
     pixel, depth = camera.project(points.reshape(len(cone), 16, 3))
@@ -67,14 +58,9 @@ def _to_srgb(image: NDArray[np.float64]) -> NDArray[np.uint8]:
     return _SRGB[(np.clip(image, 0.0, 1.0) * (len(_SRGB) - 1) + 0.5).astype(np.uint16)]
 
 
-def _encoded(levels: int) -> NDArray[np.uint8]:
-    """sRGB values of linear ones from 0 to 1."""
-    value = np.linspace(0.0, 1.0, levels)
-    encoded = np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1.0 / 2.4) - 0.055)
-    return (255.0 * encoded + 0.5).astype(np.uint8)
-
-
-_SRGB = _encoded(1 << 14)
+_LINEAR = np.linspace(0.0, 1.0, 1 << 14)
+_ENCODED = np.where(_LINEAR <= 0.0031308, 12.92 * _LINEAR, 1.055 * _LINEAR ** (1.0 / 2.4) - 0.055)
+_SRGB = (255.0 * _ENCODED + 0.5).astype(np.uint8)
 
 
 @jit
@@ -95,7 +81,7 @@ def _draw(drawing, view, rooks):
                 red, green, blue = 0.0, 0.0, 0.0
                 for k in range(rays):
                     x, y = (0.5, 0.5) if sweep == 0 else (rooks[k, 0], rooks[k, 1])
-                    r, g, b = _look(drawing, view, i + x, j + y, depth, layer, place)
+                    r, g, b = _colour_at(drawing, view, i + x, j + y, depth, layer, place)
                     red, green, blue = red + min(r, 1.0), green + min(g, 1.0), blue + min(b, 1.0)
                 image[j, i, 0], image[j, i, 1], image[j, i, 2] = red / rays, green / rays, blue / rays
         if sweep == 0:
@@ -121,7 +107,7 @@ def _edges(image):
 
 
 @jit
-def _look(drawing, view, x, y, depth, layer, place):
+def _colour_at(drawing, view, x, y, depth, layer, place):
     """Linear colour at pixel coordinates (x, y); depth, layer and place are room for translucent surfaces."""
     across = (x - 0.5 * view.width) / view.focal
     upward = (0.5 * view.height - y) / view.focal

@@ -2,6 +2,7 @@
 
 const { CatmullRomCurve3, Color, Vector3 } = THREE;
 const ARRAYS = { uint8: Uint8Array, int8: Int8Array, uint16: Uint16Array, uint32: Uint32Array, float32: Float32Array };
+const by = (id) => document.getElementById(id);
 const clamp = (x, low, high) => Math.min(Math.max(x, low), high);
 const mix = (a, b, t) => a + (b - a) * t;
 const count = (n) => Array.from({ length: n }, (_, k) => k);
@@ -21,7 +22,7 @@ async function unpacked(tree) {
 }
 
 async function readEpisode() {
-  const episode = await unpacked(JSON.parse(document.getElementById("episode").textContent));
+  const episode = await unpacked(JSON.parse(by("episode").textContent));
   const { arrays, nodes, slots, steps } = episode;
   const bits = (bytes) => (step, index) => (bytes[(step * bytes.length) / (steps + 1) + (index >> 3)] >> (index & 7)) & 1;
   const [contact, edge] = [bits(arrays.contact), bits(arrays.edge)];

@@ -3,7 +3,6 @@
 const SPEEDS = [0.05, 0.1, 0.25, 0.5, 1, 2, 4, 8, 16];
 
 async function main() {
-  const by = (id) => document.getElementById(id);
   const episode = await readEpisode();
   readPaint(episode.colours);
   const canvas = by("scene");
@@ -11,8 +10,9 @@ async function main() {
   const show = { edges: true, actions: true, path: true, labels: true, clear: episode.wall };
   const state = { time: 0, playing: false, speed: 1, theme: readTheme(), choice: { stage: null, layer: null, head: null }, show };
   const hash = new URLSearchParams(location.hash.slice(1));
-  const scene = hash.get("renderer") === "2d" ? null : makeScene(canvas, episode, view);
-  by("notice").hidden = scene !== null;
+  const flat = hash.get("renderer") === "2d" || !document.createElement("canvas").getContext("webgl2");
+  const scene = flat ? null : new ArmScene(canvas, episode, view);
+  by("notice").hidden = !flat;
   let waiting = false;
   let before = null;
   let ratio = 1;
@@ -44,7 +44,7 @@ async function main() {
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
     context.clearRect(0, 0, view.width, view.height);
     if (scene) scene.draw(time, rod, [...path, ...edges], theme, show, ratio);
-    else drawFlat(context, episode, rod, time, [...path, ...edges], view);
+    else drawFlat(context, episode, rod, view);
     if (show.labels) drawLabels(context, episode, rod, view);
     readOuts(episode, state);
     plots.draw();
@@ -107,12 +107,6 @@ async function main() {
   setPlaying(!still);
 }
 
-// Null where this browser has no WebGL 2.
-function makeScene(canvas, episode, view) {
-  if (!document.createElement("canvas").getContext("webgl2")) return null;
-  return new ArmScene(canvas, episode, view);
-}
-
 function chooseSpeeds(select, episode, state) {
   for (const speed of SPEEDS) select.add(new Option(`${speed}×`, speed));
   // an episode lasts about eight seconds
@@ -126,6 +120,7 @@ function listenForKeys({ episode, state, view, seek, setPlaying }) {
   const actions = {
     ArrowRight: (size) => seek(Math.floor(state.time + 1e-6) + size),
     ArrowLeft: (size) => seek(Math.ceil(state.time - 1e-6) - size),
+    " ": () => setPlaying(!state.playing),
     Home: () => seek(0),
     End: () => seek(episode.steps),
     r: () => view.reset(),
@@ -134,17 +129,12 @@ function listenForKeys({ episode, state, view, seek, setPlaying }) {
     "-": () => view.zoom(1.15),
   };
   document.addEventListener("keydown", (event) => {
-    if (event.ctrlKey || event.metaKey || event.altKey) return;
     const at = event.target;
-    if (at instanceof HTMLSelectElement) return;
-    if (event.key === " ") {
-      if (at instanceof HTMLButtonElement || at.type === "checkbox") return; // these have a use for it
-      setPlaying(!state.playing);
-    } else {
-      const action = actions[event.key] || actions[event.key.toLowerCase()];
-      if (!action) return;
-      action(event.shiftKey ? 10 : 1);
-    }
+    if (event.ctrlKey || event.metaKey || event.altKey || at instanceof HTMLSelectElement) return;
+    if (event.key === " " && (at instanceof HTMLButtonElement || at.type === "checkbox")) return; // these have a use for it
+    const action = actions[event.key] || actions[event.key.toLowerCase()];
+    if (!action) return;
+    action(event.shiftKey ? 10 : 1);
     event.preventDefault();
   });
 }
@@ -153,74 +143,52 @@ function listenForKeys({ episode, state, view, seek, setPlaying }) {
 
 const OUTCOMES = { success: "Target reached", diverged: "Simulation diverged", open: "Target not reached" };
 
-function outcomeOf(episode) {
-  return episode.diverged ? "diverged" : episode.success ? "success" : "open";
-}
-
 function describe(episode) {
-  const outcome = document.getElementById("outcome");
+  const outcome = by("outcome");
+  const ending = episode.diverged ? "diverged" : episode.success ? "success" : "open";
   const seconds = (episode.steps * episode.controlDt).toFixed(2);
-  outcome.classList.add(outcomeOf(episode));
-  outcome.textContent = `${OUTCOMES[outcomeOf(episode)]} after ${episode.steps} steps, ${seconds} s`;
-  document.getElementById("scene").setAttribute(
-    "aria-label",
-    `Soft arm of ${episode.agents} sections, task ${episode.task}, ${episode.cylinders.length} obstacles. ${outcome.textContent}.`,
-  );
+  outcome.classList.add(ending);
+  outcome.textContent = `${OUTCOMES[ending]} after ${episode.steps} steps, ${seconds} s`;
+  const scene = `Soft arm of ${episode.agents} sections, task ${episode.task}, ${episode.cylinders.length} obstacles.`;
+  by("scene").setAttribute("aria-label", `${scene} ${outcome.textContent}.`);
 }
 
 const millimetres = (metres) => `${(1000 * metres).toFixed(0)} mm`;
 
 function readOuts(episode, state) {
-  const by = (id) => document.getElementById(id);
   const step = Math.floor(state.time);
-  const found = episode.slots.filter((slot) => slot.step <= step).length;
   by("time").value = step;
   by("time").setAttribute("aria-valuetext", `step ${step} of ${episode.steps}`);
-  const seconds = document.createElement("small");
-  seconds.textContent = `${(state.time * episode.controlDt).toFixed(2)} s`;
+  const seconds = Object.assign(document.createElement("small"), { textContent: `${(state.time * episode.controlDt).toFixed(2)} s` });
   by("clock").replaceChildren(`${step} / ${episode.steps}`, seconds);
-  by("n-distance").textContent = millimetres(episode.distance[step]);
-  by("n-reward").textContent = step ? minus(episode.reward[step - 1].toFixed(2)) : "–";
-  by("n-return").textContent = minus(episode.returned[step].toFixed(1));
-  by("n-contact").textContent = episode.touching[step];
-  by("n-bins").textContent = found;
-  by("c-distance").textContent = `success below ${millimetres(episode.successRadius)}`;
+  const texts = {
+    "n-distance": millimetres(episode.distance[step]),
+    "n-reward": step ? minus(episode.reward[step - 1].toFixed(2)) : "–",
+    "n-return": minus(episode.returned[step].toFixed(1)),
+    "n-contact": episode.touching[step],
+    "n-bins": episode.slots.filter((slot) => slot.step <= step).length,
+    "c-distance": `success below ${millimetres(episode.successRadius)}`,
+  };
+  for (const [id, text] of Object.entries(texts)) by(id).textContent = text;
 }
 
 function speak(episode, state) {
   const step = Math.floor(state.time);
-  document.getElementById("spoken").textContent =
+  by("spoken").textContent =
     `Step ${step} of ${episode.steps}: ${millimetres(episode.distance[step])} to the target, ${episode.touching[step]} nodes in contact.`;
 }
 
-// Without WebGL: thick strokes with round ends, the far ones first.
-function drawFlat(context, episode, rod, time, segments, view) {
-  const strokes = [];
-  const stroke = (start, end, colour, thick) => {
-    const [a, b] = [view.project(start), view.project(end)];
-    if (Math.min(a.metres, b.metres) > 0) strokes.push({ a, b, colour, width: thick(a.metres), far: a.metres + b.metres });
+// Without WebGL: thick strokes with round ends, one over the other.
+function drawFlat(context, episode, rod, view) {
+  const stroke = (start, end, radius, colour) => {
+    const [a, b] = [view.project(start), view.project(along(end, UP, 1e-4))]; // a stroke without length is none
+    if (Math.min(a.metres, b.metres) <= 0) return;
+    Object.assign(context, { lineCap: "round", lineWidth: (2 * radius) / a.metres, strokeStyle: colour });
+    context.stroke(new Path2D(`M${a.x} ${a.y}L${b.x} ${b.y}`));
   };
-  for (const { start, axis, length, radius } of episode.cylinders) {
-    stroke(start, along(start, axis, length), css(PAINT.column, 0.6), (metres) => (2 * radius) / metres);
-  }
-  for (const { centre, half, axis, radius, step } of episode.slots) {
-    if (step <= time) stroke(along(centre, axis, -half), along(centre, axis, half), css(PAINT.discovered, 0.5), (metres) => (2 * radius) / metres);
-  }
-  rod.slice(1).forEach((node, i) => {
-    const colour = mixed(gradient(PAINT.arm, i / episode.elements), PAINT.touch, 0.7 * node.contact);
-    stroke(rod[i].centre, node.centre, css(colour), (metres) => (2 * node.radius) / metres);
-  });
-  stroke(episode.target, episode.target, css(PAINT.target, 0.6), (metres) => (2 * episode.successRadius) / metres);
-  for (const { start, end, width } of segments) stroke(start.at, end.at, css(end.colour, end.alpha), () => width);
-  context.lineCap = "round";
-  for (const { a, b, colour, width } of strokes.sort((p, q) => q.far - p.far)) {
-    context.strokeStyle = colour;
-    context.lineWidth = width;
-    context.beginPath();
-    context.moveTo(a.x, a.y);
-    context.lineTo(b.x + 0.01, b.y);
-    context.stroke();
-  }
+  for (const c of episode.cylinders) stroke(c.start, along(c.start, c.axis, c.length), c.radius, css(PAINT.column, 0.5));
+  rod.slice(1).forEach((node, i) => stroke(rod[i].centre, node.centre, node.radius, css(gradient(PAINT.arm, i / rod.length))));
+  stroke(episode.target, episode.target, episode.successRadius, css(PAINT.target, 0.6));
 }
 
 function drawLabels(context, episode, rod, view) {

@@ -3,7 +3,6 @@
 const STAGES = { stage1: "obstacles → agents", stage2: "agents ↔ agents" };
 
 function makeMatrix(episode, state, changed) {
-  const by = (id) => document.getElementById(id);
   const names = Object.keys(STAGES).filter((name) => episode.attention[name]);
   if (!names.length) {
     by("s-edges-name").textContent = "sensed bins";

@@ -84,7 +84,6 @@ function paintLines(context, width, height, lines, low, high, theme, extra) {
 
 function makePlots(episode, state, seek) {
   const { agents, distance, earned, steps, touching } = episode;
-  const by = (id) => document.getElementById(id);
   const shown = count(earned.length).filter((k) => earned[k].some((x) => x !== 0));
   // the bonus of the last step would flatten all others
   const ordinary = shown.filter((k) => episode.terms[k] !== "success").flatMap((k) => earned[k]);

@@ -201,7 +201,7 @@ class ArmScene {
       const half = 0.93 * slot.half;
       const radius = slot.radius * (1.03 + 0.14 * flash);
       this.bins.setMatrixAt(shown, placed(along(slot.centre, slot.axis, -half), slot.axis, 2 * half, radius));
-      const colour = mixed(PAINT.column, PAINT.discovered, sensed ? 1 : 0.72).lerp(PAINT.fresh, flash);
+      const colour = mixed(PAINT.column, PAINT.discovered, sensed ? 1 : 0.72).lerp(PAINT.new, flash);
       this.bins.setColorAt(shown++, colour.multiplyScalar(1 + 0.2 * flash));
     });
     this.depths[0].count = this.bins.count = shown;
