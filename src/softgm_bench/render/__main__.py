@@ -69,8 +69,8 @@ def main(arguments: list[str]) -> None:
     source, options, overrides = command.parse(
         arguments, Options, "policy, checkpoint, run folder or recorded episode", others=True
     )
-    files = _files(options)
-    _check(options, {file.suffix for file in files})
+    files = [Path(name) for name in options.out.split(",") if name]
+    _check(options, files)
     from softgm_bench.experiment import trajectory as episodes  # late: what is refused should not wait
     from softgm_bench.experiment.loop import set_threads
 
@@ -91,17 +91,11 @@ def main(arguments: list[str]) -> None:
         print(f"{episodes.describe(trajectory.info)}: {file}")
 
 
-def _files(options: Options) -> list[Path]:
-    files = [Path(name) for name in options.out.split(",") if name]
-    if not files:
-        raise UserError(f"out: name a file that ends in {', '.join(KINDS)}")
-    for file in files:
-        if file.suffix not in KINDS:
-            raise UserError(f"{file}: its name must end in one of {', '.join(KINDS)}")
-    return files
-
-
-def _check(options: Options, kinds: set[str]) -> None:
+def _check(options: Options, files: list[Path]) -> None:
+    wrong = [f"{file}: its name must end in one of" for file in files if file.suffix not in KINDS]
+    if wrong or not files:
+        raise UserError(f"{wrong[0] if wrong else 'out: name a file that ends in'} {', '.join(KINDS)}")
+    kinds = {file.suffix for file in files}
     for name, (low, high) in RANGES.items():
         value = getattr(options, name)
         if value is not None and not low <= value <= high:
@@ -128,25 +122,25 @@ def _write(trajectory: "Trajectory", options: Options, file: Path) -> None:
         write_html(trajectory, file, azimuth=options.azimuth, elevation=options.elevation)
         return
     from softgm_bench.experiment.run_folder import write_where_asked
-
-    write_where_asked(file, _draw(trajectory, options, file.suffix))
-
-
-def _draw(trajectory: "Trajectory", options: Options, kind: str) -> bytes:
     from softgm_bench.render import video
     from softgm_bench.render.still import PictureSettings, Studio, png
 
-    text = kind != ".png" if options.text is None else options.text
+    still = file.suffix == ".png"
+    text = not still if options.text is None else options.text
     names = ("width", "height", "azimuth", "elevation", "distance", "attention")
     settings: dict[str, Any] = {name: getattr(options, name) for name in names}
     studio = Studio(trajectory, PictureSettings(text=text, **settings))
-    if kind == ".png":
-        return png(studio.picture(float(trajectory.steps) if options.step is None else options.step))
+    if still:
+        write_where_asked(file, png(studio.picture(float(trajectory.steps) if options.step is None else options.step)))
+        return
     control_dt = studio.stage.control_dt
     speed = options.speed or video.natural_speed(trajectory.steps * control_dt)
     times = video.moments(trajectory.steps, control_dt, options.fps, speed)
     frames = video.pictures(studio, times, speed, options.threads)
-    return video.mp4(frames, options.fps) if kind == ".mp4" else video.animated(frames, options.fps, kind[1:])
+    mp4 = file.suffix == ".mp4"
+    write_where_asked(
+        file, video.mp4(frames, options.fps) if mp4 else video.animated(frames, options.fps, file.suffix[1:])
+    )
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """A perspective camera, and one that shows given points as large as they fit."""
 
-from dataclasses import dataclass
 from math import atan2, cos, degrees, radians, sin, tan
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ BEHIND_A_WALL = (-40.0, 20.0)
 BESIDE_POSTS = (-62.0, 22.0)
 BESIDE_THE_MOTION = (-65.0, 16.0)  # the first one from the target's direction
 MANY = 8  # cylinders that make up a wall
+MARGIN = 0.06  # part of width and height that stays free at each border
 NEAR = 0.05  # m in front of the camera, nothing nearer is drawn
 CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])  # of a box about 0
 
@@ -31,8 +32,7 @@ def direction(
     return default[0] if azimuth is None else azimuth, default[1] if elevation is None else elevation
 
 
-@dataclass(frozen=True)
-class Camera:
+class Camera(NamedTuple):
     """The place from which a picture is taken, and its size; +z is up."""
 
     position: Array  # m, (3,)
@@ -65,21 +65,15 @@ def look_at(centre: Array, azimuth: float, elevation: float, distance: float, wi
 
 
 def fit(
-    points: Array,
-    azimuth: float,
-    elevation: float,
-    width: int,
-    height: int,
-    margin: float = 0.06,
-    distance: float | None = None,
+    points: Array, azimuth: float, elevation: float, width: int, height: int, *, distance: float | None = None
 ) -> Camera:
     """The camera from a direction that shows all points (m, ``(n, 3)``), centred and as large as possible.
 
-    A part ``margin`` of width and height stays free at each border; ``distance``, m, is kept where it is given.
+    A part ``MARGIN`` of width and height stays free at each border; ``distance``, m, is kept where it is given.
     """
     centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
     reach = float(np.linalg.norm(points - centre, axis=1).max()) + NEAR
-    border = margin * np.array([width, height])
+    border = MARGIN * np.array([width, height])
 
     def nearest() -> float:  # by bisection: the further, the smaller everything is
         low, high = 0.0, 200.0 * reach

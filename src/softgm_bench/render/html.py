@@ -31,6 +31,7 @@ SCRIPTS = [f"{name}.js" for name in PARTS.split()]
 COLOURS = {
     name.lower(): value for name, value in vars(style).items() if name.isupper() and isinstance(value, str | tuple)
 }
+CYLINDER = ("start", "axis", "length", "radius")
 ATTENTION_BYTES = 1_500_000  # of both stages together; a longer episode keeps the weights of every k-th step
 
 
@@ -77,7 +78,7 @@ def payload(trajectory: Trajectory) -> dict[str, Any]:
     """
     task, rod = trajectory.config["task"], trajectory.config["rod"]
     slots, stage = _slots(trajectory), Stage(trajectory)
-    extent = stage.extent()
+    extent, cylinders = stage.extent(), trajectory.cylinders
     packed = {
         "position": _rounded(trajectory.position.transpose(0, 2, 1), np.uint16),
         "normal": _array(np.rint(127.0 * trajectory.director[:, 0].transpose(0, 2, 1)), np.int8, scale=1.0 / 127.0),
@@ -91,7 +92,6 @@ def payload(trajectory: Trajectory) -> dict[str, Any]:
     if np.any(trajectory.tip_force):
         packed["force"] = _array(trajectory.tip_force, np.float32)
     return {
-        "format": 1,
         "task": task["name"],
         "label": str(trajectory.info["label"]),
         "steps": trajectory.steps,
@@ -104,9 +104,9 @@ def payload(trajectory: Trajectory) -> dict[str, Any]:
         "success": bool(trajectory.success),
         "diverged": bool(trajectory.diverged),
         "target": _numbers(trajectory.target),
-        "cylinders": _cylinders(trajectory.cylinders),
+        "cylinders": [_numbers(row) for row in np.column_stack([cylinders[name] for name in CYLINDER])],
         "wall": stage.wall,
-        "floor": round(stage.floor, 6),
+        "floor": round(float(extent[:, 2].min()), 6),
         "extent": [_numbers(extent[corner]) for corner in ConvexHull(extent).vertices],
         "slots": slots,
         "terms": list(trajectory.reward_terms),
@@ -118,12 +118,6 @@ def payload(trajectory: Trajectory) -> dict[str, Any]:
 
 def _numbers(values: NDArray) -> list[float]:
     return [round(float(value), 6) for value in values]
-
-
-def _cylinders(cylinders: dict[str, NDArray]) -> list[list[float]]:
-    """Start, axis, length, radius of each."""
-    columns = [cylinders["start"], cylinders["axis"], cylinders["length"][:, None], cylinders["radius"][:, None]]
-    return [_numbers(row) for row in np.concatenate(columns, axis=1)]
 
 
 def _slots(trajectory: Trajectory) -> list[dict[str, Any]]:

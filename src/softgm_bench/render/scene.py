@@ -12,6 +12,7 @@ from softgm_bench.render.grid import make_grid
 from softgm_bench.render.shading import ARM, CYLINDER, MARK, OCCLUSION_REACH, OTHER, PENUMBRA, Drawing
 
 Array = NDArray[np.float64]
+Pair = tuple[float, float]
 
 SEEN_THROUGH = 0.34  # opacity of walls
 FRESH = 0.3  # s during which a discovered bin is shown as new
@@ -43,14 +44,7 @@ class Parts:
         self.texture.append(texture)
         return len(self.texture) - 1
 
-    def add(
-        self,
-        cone: Array,
-        row: int,
-        owner: int = OTHER,
-        span: tuple[float, float] = (0.0, 1.0),
-        shine: tuple[float, float] = (0.0, 0.3),
-    ) -> None:
+    def add(self, cone: Array, row: int, owner: int = OTHER, span: Pair = (0.0, 1.0), shine: Pair = (0.0, 0.3)) -> None:
         """Add a round cone that is seen; arguments as the fields of ``Drawing``."""
         self.seen.append((cone, owner, row, span, shine))
 
@@ -58,13 +52,10 @@ class Parts:
         """Add a round cone that takes a part of the light from others."""
         self.blocking.append((cone, owner, part))
 
-    def drawing(self, light: Array, floor: float, highest: float) -> Drawing:
-        """Everything that was added, sorted into grids.
+    def drawing(self, light: Array, floor: float, below: float) -> Drawing:
+        """Everything that was added, sorted into grids; ``light`` and ``floor`` as in ``Drawing``.
 
-        Args:
-            light: rows of the light's frame, the last one towards the light, ``(3, 3)``.
-            floor: its height, m.
-            highest: how far below a blocker and the floor its shadow is still looked for, m.
+        Shadows reach ``below`` m below the floor.
         """
         cone, owner, row, span, shine = (np.array(column) for column in zip(*self.seen, strict=True))
         blocker, blocker_owner, strength = (np.array(column) for column in zip(*self.blocking, strict=True))
@@ -74,7 +65,7 @@ class Parts:
         near_grid = make_grid(low - OCCLUSION_REACH, high + OCCLUSION_REACH, 0.1)
         in_light = np.concatenate([blocker[:, 0:3] @ light.T, blocker[:, 4:7] @ light.T], axis=1)
         # the penumbra is widest on the floor, or on what is below it in the picture
-        away = np.maximum(in_light[:, 2], in_light[:, 5]) - floor * light[2, 2] + highest
+        away = np.maximum(in_light[:, 2], in_light[:, 5]) - floor * light[2, 2] + below
         wide = (ends[..., 3].max(axis=1) + PENUMBRA * np.maximum(away, 0.0))[:, None] * [1.0, 1.0, 0.0]
         flat = in_light.reshape(-1, 2, 3) * [1.0, 1.0, 0.0]
         shadow_grid = make_grid(flat.min(axis=1) - wide, flat.max(axis=1) + wide, 0.04)
@@ -88,12 +79,9 @@ class Stage:
     """Everything about an episode that does not change from moment to moment."""
 
     def __init__(self, trajectory: Trajectory, attention: bool = False, camera_azimuth: float = 0.0) -> None:
-        """Prepare an episode.
+        """Prepare an episode: ``attention``, where it has any, is drawn as edges.
 
-        Args:
-            trajectory: the episode.
-            attention: draw attention as edges where the trajectory has it.
-            camera_azimuth: degrees; the light comes from the camera's left.
+        The light comes from the left of a camera at ``camera_azimuth`` degrees.
         """
         self.trajectory = trajectory
         self.attention = attention and "stage1" in trajectory.attention

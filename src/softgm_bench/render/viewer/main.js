@@ -13,9 +13,7 @@ async function main() {
   const flat = hash.get("renderer") === "2d" || !document.createElement("canvas").getContext("webgl2");
   const scene = flat ? null : new ArmScene(canvas, episode, view);
   by("notice").hidden = !flat;
-  let waiting = false;
-  let before = null;
-  let ratio = 1;
+  let [waiting, before, ratio] = [false, null, 1];
 
   function changed() {
     if (!waiting) requestAnimationFrame(tick);
@@ -47,8 +45,7 @@ async function main() {
     else drawFlat(context, episode, rod, view);
     if (show.labels) drawLabels(context, episode, rod, view);
     readOuts(episode, state);
-    plots.draw();
-    matrix.draw();
+    for (const plot of plots) plot.draw();
   }
 
   function seek(time) {
@@ -72,13 +69,11 @@ async function main() {
     Object.assign(by("overlay"), { width: Math.round(width * ratio), height: Math.round(height * ratio) });
     const header = document.querySelector("header").offsetHeight;
     view.resize(width, height, [Math.min(header + 16, 0.3 * height), 20, 34, 20]);
-    plots.resize();
-    matrix.resize();
+    for (const plot of plots) plot.resize();
     draw();
   }
 
-  const plots = makePlots(episode, state, seek);
-  const matrix = makeMatrix(episode, state, changed);
+  const plots = [...makePlots(episode, state, seek), ...makeMatrix(episode, state, changed)];
 
   by("time").max = episode.steps;
   by("time").addEventListener("input", (event) => seek(Number(event.target.value)));
@@ -86,20 +81,14 @@ async function main() {
   chooseSpeeds(by("speed"), episode, state);
   for (const name of Object.keys(show)) {
     by(`s-${name}`).checked = show[name];
-    by(`s-${name}`).addEventListener("change", (event) => {
-      show[name] = event.target.checked;
-      changed();
-    });
+    by(`s-${name}`).addEventListener("change", (event) => changed((show[name] = event.target.checked)));
   }
   const views = { home: [], front: [Math.PI, 0.12], side: [-Math.PI / 2, 0.12], top: [-Math.PI / 2, 1.5] };
   for (const [name, angles] of Object.entries(views)) by(`view-${name}`).addEventListener("click", () => view.reset(...angles));
   listenForKeys({ episode, state, view, seek, setPlaying });
   canvas.addEventListener("webglcontextrestored", changed);
   new ResizeObserver(resize).observe(document.querySelector(".stage"));
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
-    state.theme = readTheme();
-    resize();
-  });
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => resize((state.theme = readTheme())));
   describe(episode);
   state.time = clamp(Number(hash.get("step")) || 0, 0, episode.steps);
   const still = matchMedia("(prefers-reduced-motion: reduce)").matches || hash.has("step");

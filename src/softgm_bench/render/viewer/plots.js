@@ -16,9 +16,7 @@ class Plot {
     canvas.addEventListener("pointermove", (event) => event.buttons && go(event));
   }
 
-  resize() {
-    this.still = null;
-  }
+  resize() { this.still = null; }
 
   draw() {
     const { canvas } = this;
@@ -53,7 +51,7 @@ function tidySteps(low, high, wanted) {
 const minus = (text) => text.replace("-", "−");
 
 const scales = (width, height, steps, low, high) => [
-  (step) => (step / Math.max(steps, 1)) * (width - 2) + 1,
+  (step) => (step / steps) * (width - 2) + 1,
   (value) => 16 + (height - 20) * (1 - (value - low) / (high - low || 1)),
 ];
 
@@ -87,8 +85,7 @@ function makePlots(episode, state, seek) {
   const shown = count(earned.length).filter((k) => earned[k].some((x) => x !== 0));
   // the bonus of the last step would flatten all others
   const ordinary = shown.filter((k) => episode.terms[k] !== "success").flatMap((k) => earned[k]);
-  const extreme = (pick) => ordinary.reduce((most, value) => pick(most, value), 0);
-  const [low, high] = [extreme(Math.min), Math.max(extreme(Math.max), 1e-9)];
+  const [low, high] = [Math.min, Math.max].map((pick) => ordinary.reduce((most, value) => pick(most, value), 0));
   const far = Math.max(...distance) * 1.04;
   const colour = (k) => SERIES[k % SERIES.length];
   const cursor = (context, width, height) => {
@@ -161,11 +158,7 @@ function makePlots(episode, state, seek) {
     by("legend").append(item);
     return () => (value.textContent = minus(earned[k][Math.floor(state.time)].toFixed(2)));
   });
-  const plots = [way, terms, actions, events];
-  return {
-    resize: () => plots.forEach((plot) => plot.resize()),
-    draw: () => [...plots.map((plot) => () => plot.draw()), ...legend].forEach((write) => write()),
-  };
+  return [way, terms, actions, events, { draw: () => legend.forEach((write) => write()), resize: () => {} }];
 }
 
 function disc(context, x, y, radius, colour, rim, thick) {

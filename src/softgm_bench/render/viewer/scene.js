@@ -10,30 +10,25 @@ THREE.ShaderChunk.shadowmap_pars_fragment = THREE.ShaderChunk.shadowmap_pars_fra
     shadow += texture(shadowMap, vec3(shadowCoord.xy + vec2(i % 3 - 1, i / 3 - 1) * radius, shadowCoord.z)) / 9.0;`,
 );
 
+const patched = (material, place, text) => Object.assign(material, {
+  onBeforeCompile: (shader) => (shader.fragmentShader = shader.fragmentShader.replace(place, text)),
+});
 // See-through things throw a fourth of a shadow: one texel in four, which the soft lookup blurs.
-const quarterShadow = new THREE.MeshDepthMaterial();
-quarterShadow.onBeforeCompile = (shader) => {
-  const drop = "void main() {\nif ((int(gl_FragCoord.x) & 1) + (int(gl_FragCoord.y) & 1) > 0) discard;";
-  shader.fragmentShader = shader.fragmentShader.replace("void main() {", drop);
-};
-
+const quarterShadow = patched(new THREE.MeshDepthMaterial(), "void main() {", `void main() {
+  if ((int(gl_FragCoord.x) & 1) + (int(gl_FragCoord.y) & 1) > 0) discard;`);
 // A sphere that is seen at its rim rather than in its middle.
-function shellMaterial(more) {
-  const material = new THREE.MeshStandardMaterial({ transparent: true, depthWrite: false, roughness: 0.5, ...more });
-  material.onBeforeCompile = (shader) => {
-    const rim = "diffuseColor.a *= 0.45 + 1.5 * pow(1.0 - abs(dot(normal, normalize(vViewPosition))), 1.6);\n#include <opaque_fragment>";
-    shader.fragmentShader = shader.fragmentShader.replace("#include <opaque_fragment>", rim);
-  };
-  return material;
-}
+const shellMaterial = (more) => patched(
+  new THREE.MeshStandardMaterial({ transparent: true, depthWrite: false, roughness: 0.5, ...more }), "#include <opaque_fragment>",
+  "diffuseColor.a *= 0.45 + 1.5 * pow(1.0 - abs(dot(normal, normalize(vViewPosition))), 1.6);\n#include <opaque_fragment>",
+);
 
 // Lines every 10 cm and every 50 cm that fade with the distance from the middle.
 const GRID = {
   vertexShader: `
     varying vec2 place;
     void main() {
-      place = (modelMatrix * vec4(position, 1.0)).xy;
-      gl_Position = projectionMatrix * viewMatrix * vec4((modelMatrix * vec4(position, 1.0)).xyz, 1.0);
+      place = position.xy;
+      gl_Position = projectionMatrix * modelViewMatrix * vec4(position, 1.0);
     }`,
   fragmentShader: `
     varying vec2 place;
@@ -88,17 +83,16 @@ class ArmScene {
 
   // From the upper left, before the scene, as the default camera sees it; a little from the camera; the sky's.
   lights() {
-    const sun = new THREE.DirectionalLight(0xffffff, 0.95 * Math.PI);
+    const sun = Object.assign(new THREE.DirectionalLight(0xffffff, 0.95 * Math.PI), { castShadow: true });
     const azimuth = (this.episode.camera.azimuth * Math.PI) / 180;
-    const [c, s] = [Math.cos(azimuth), Math.sin(azimuth)];
-    sun.position.copy(along(this.centre, new Vector3(0.35 * s + 0.62 * c, 0.62 * s - 0.35 * c, 1).normalize(), 2 * this.reach));
+    const direction = new Vector3(0.62, -0.35, 1).normalize().applyAxisAngle(UP, azimuth);
+    sun.position.copy(along(this.centre, direction, 2 * this.reach));
     sun.target.position.copy(this.centre);
-    sun.castShadow = true;
     const size = 1.05 * this.reach;
     Object.assign(sun.shadow.camera, { left: -size, right: size, bottom: -size, top: size, near: 0.1, far: 4 * this.reach });
     Object.assign(sun.shadow, { normalBias: 0.006, bias: -0.0006, radius: 1.4 });
     sun.shadow.mapSize.set(2048, 2048);
-    this.sky = new THREE.HemisphereLight();
+    this.sky = new THREE.HemisphereLight(0, 0, Math.PI);
     this.sky.position.copy(UP);
     this.view.camera.add(new THREE.DirectionalLight(0xffffff, 0.18 * Math.PI));
     this.scene.add(sun, sun.target, this.sky, this.view.camera);
@@ -152,7 +146,6 @@ class ArmScene {
     const reached = this.episode.success && time >= this.episode.steps;
     this.renderer.setPixelRatio(pixels);
     this.renderer.setSize(this.view.width, this.view.height, false);
-    this.renderer.setClearColor(theme.back);
     this.setTheme(theme);
     this.setClear(show.clear);
     this.arm.set(rod, reached);
@@ -168,10 +161,10 @@ class ArmScene {
   }
 
   setTheme(theme) {
+    this.renderer.setClearColor(theme.back);
     const [sky, ground] = theme.dark ? [[0.3, 0.34, 0.42], [0.1, 0.1, 0.12]] : [[0.5, 0.53, 0.58], [0.24, 0.23, 0.23]];
     this.sky.color.setRGB(...sky);
     this.sky.groundColor.setRGB(...ground);
-    this.sky.intensity = Math.PI;
     this.shade.opacity = theme.dark ? 0.5 : 0.26;
     this.grid.uniforms.colour.value.lerpColors(theme.line, theme.soft, theme.dark ? 0.4 : 0.5);
     this.grid.uniforms.lit.value = theme.dark ? 0.09 : 0;
@@ -210,10 +203,7 @@ class ArmScene {
 
   setTarget(reached, clear) {
     const colour = reached ? PAINT.reached : PAINT.target;
-    for (const { material } of [this.core, this.shell, this.behind]) {
-      material.color.copy(colour);
-      material.emissive.copy(colour);
-    }
+    for (const { material } of [this.core, this.shell, this.behind]) material.emissive = material.color = colour;
     this.shell.material.opacity = reached ? 0.5 : 0.26;
     this.behind.material.opacity = this.shell.material.opacity * (clear ? 0.8 : 0.4);
     this.behind.renderOrder = clear ? ORDER.seen : ORDER.behind; // with solid obstacles, not through the arm
