@@ -8,5 +8,5 @@ from softgm_bench.rod import sync
 
 @contextmanager
 def force_dense():
-    with mock.patch.object(sync, "is_free", lambda device: False):
+    with mock.patch.object(sync, "is_free", return_value=False):
         yield

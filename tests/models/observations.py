@@ -9,7 +9,7 @@ from softgm_bench.envs.interface import Sizes
 from softgm_bench.models import ActorConfig, SoftGMConfig, ValueConfig
 
 SEEDS = strategies.integers(0, 2**31)
-SIZES = strategies.tuples(strategies.integers(1, 5), strategies.integers(0, 6))  # N, M
+COUNTS = strategies.tuples(strategies.integers(1, 5), strategies.integers(0, 6))  # N, M
 LEADS = strategies.sampled_from([(), (1,), (4,), (2, 3)])
 
 

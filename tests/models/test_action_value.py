@@ -113,7 +113,7 @@ def test_the_teams_value_is_that_of_all_observations_and_then_all_actions(encode
 
 def test_a_critic_may_have_an_mlp_of_its_own_whatever_the_actors_model():
     config = ActionValueConfig(widths=[8], mlp=MLP, asymmetric=False)
-    build = functools.partial(build_action_value, softgm_config(), 5, 6, config)
+    build = functools.partial(build_action_value, softgm_config(), Sizes(5, 2, n_slots=6), config)
     assert isinstance(build(centralised=True).encoder, MLPTeamEncoder)
     assert isinstance(build(centralised=False).encoder, MLPEncoder)
 

@@ -2,7 +2,7 @@ import math
 
 import torch
 from hypothesis import given, settings
-from observations import LEADS, SEEDS, SIZES, observation
+from observations import COUNTS, LEADS, SEEDS, observation
 from tensordict import TensorDict
 
 from softgm_bench.envs import entries
@@ -65,7 +65,7 @@ def test_velocity_scale_changes_the_velocity_alone():
 
 
 @settings(max_examples=30, deadline=None)
-@given(LEADS, SIZES, SEEDS)
+@given(LEADS, COUNTS, SEEDS)
 def test_pad_nodes_are_zero_whatever_their_descriptor(lead, sizes, seed):
     td = observation(lead, *sizes, seed=seed)
     inactive = ~td[entries.SLOT_ACTIVE].unsqueeze(-1)
@@ -76,7 +76,7 @@ def test_pad_nodes_are_zero_whatever_their_descriptor(lead, sizes, seed):
 
 
 @settings(max_examples=30, deadline=None)
-@given(LEADS, SIZES, SEEDS)
+@given(LEADS, COUNTS, SEEDS)
 def test_flat_and_graph_views_carry_the_same_content(lead, sizes, seed):
     td = observation(lead, *sizes, seed=seed)
     n_agents, n_slots = sizes
@@ -97,7 +97,7 @@ def test_flat_and_graph_views_carry_the_same_content(lead, sizes, seed):
 
 
 @settings(max_examples=30, deadline=None)
-@given(LEADS, SIZES, SEEDS)
+@given(LEADS, COUNTS, SEEDS)
 def test_sense_gathers_every_edge_once_sorted_by_target(lead, sizes, seed):
     td = observation(lead, *sizes, seed=seed)
     n_agents, n_slots = sizes

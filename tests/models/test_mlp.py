@@ -1,6 +1,6 @@
 import torch
 from hypothesis import given, settings
-from observations import LEADS, SEEDS, SIZES, observation, randomise
+from observations import COUNTS, LEADS, SEEDS, SIZES, observation, randomise
 
 from softgm_bench.envs import entries
 from softgm_bench.envs.interface import Sizes
@@ -9,7 +9,7 @@ from softgm_bench.models.mlp import MLPTeamEncoder
 
 
 @settings(max_examples=30, deadline=None)
-@given(LEADS, SIZES, SEEDS)
+@given(LEADS, COUNTS, SEEDS)
 def test_it_is_an_mlp_on_the_flat_observation(lead, sizes, seed):
     torch.manual_seed(seed)
     model = randomise(
@@ -33,7 +33,7 @@ def test_it_knows_undiscovered_slots_by_nothing():
 
 
 @settings(max_examples=30, deadline=None)
-@given(LEADS, SIZES, SEEDS)
+@given(LEADS, COUNTS, SEEDS)
 def test_the_teams_is_an_mlp_on_every_distinct_number_of_the_flat_observations(lead, sizes, seed):
     n_agents, n_slots = sizes
     torch.manual_seed(seed)

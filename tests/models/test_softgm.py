@@ -3,7 +3,7 @@ import itertools
 import pytest
 import torch
 from hypothesis import given, settings
-from observations import LEADS, SEEDS, SIZES, observation, randomise, softgm_config
+from observations import COUNTS, LEADS, SEEDS, SIZES, observation, randomise, softgm_config
 
 from softgm_bench.envs import entries
 from softgm_bench.models import SoftGMEncoder
@@ -35,7 +35,7 @@ def test_sparse_equals_dense(switches, dtype, tolerance):
 
 
 @settings(max_examples=30, deadline=None)
-@given(LEADS, SIZES, SEEDS)
+@given(LEADS, COUNTS, SEEDS)
 def test_sparse_equals_dense_for_any_sizes(lead, sizes, seed):
     n_agents, n_slots = sizes
     model = encoder(torch.float64, seed)
@@ -63,7 +63,7 @@ def test_gradients_equal_those_of_the_dense_form(gatv2):
 
 
 @settings(max_examples=30, deadline=None)
-@given(SIZES, SEEDS)
+@given(COUNTS, SEEDS)
 def test_slots_without_an_edge_change_no_bit(sizes, seed):
     model = encoder(seed=seed)
     td = observation((5,), *sizes, seed=seed)
@@ -78,7 +78,7 @@ def test_slots_without_an_edge_change_no_bit(sizes, seed):
 
 
 @settings(max_examples=30, deadline=None)
-@given(SIZES, SEEDS)
+@given(COUNTS, SEEDS)
 def test_relabelling_slots_changes_nothing(sizes, seed):
     model = encoder(torch.float64, seed)
     td = observation((5,), *sizes, seed=seed, dtype=torch.float64)
@@ -91,7 +91,7 @@ def test_relabelling_slots_changes_nothing(sizes, seed):
 
 
 @settings(max_examples=20, deadline=None)
-@given(SIZES, SEEDS)
+@given(COUNTS, SEEDS)
 def test_a_batch_of_one_equals_a_batch_of_many(sizes, seed):
     model = encoder(torch.float64, seed)
     td = observation((2, 3), *sizes, seed=seed, dtype=torch.float64)

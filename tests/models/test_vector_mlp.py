@@ -15,7 +15,7 @@ SIZES = Sizes(AGENTS, 2, n_features=FEATURES)
 def observation(size=4):
     generator = torch.Generator().manual_seed(0)
     agents = {
-        "observation": torch.randn(size, SIZES, generator=generator),
+        "observation": torch.randn(size, AGENTS, FEATURES, generator=generator),
         "action": torch.randn(size, AGENTS, 2, generator=generator).tanh(),
     }
     return TensorDict({"agents": TensorDict(agents, [size, AGENTS])}, [size])

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from softgm_bench.render.camera import fit, look_at
+from softgm_bench.render.camera import MARGIN, fit, look_at
 
 CENTRE = np.array([0.3, -0.2, 0.5])
 
@@ -25,12 +25,12 @@ def test_from_minus_y_plus_x_is_on_the_right():
 @pytest.mark.parametrize("size", [(320, 240), (120, 400)])
 def test_everything_fits_touches_a_margin_and_is_centred(size):
     points = np.random.default_rng(1).uniform(-1.0, 1.0, (50, 3)) * [0.5, 1.0, 2.0]
-    pixel, _ = fit(points, 40.0, 15.0, *size, margin=0.1).project(points)
+    pixel, _ = fit(points, 40.0, 15.0, *size).project(points)
     part = pixel / size
     low, high = part.min(axis=0), part.max(axis=0)
-    assert low.min() >= 0.1 - 1e-9
-    assert high.max() <= 0.9 + 1e-9
-    assert min(low.min(), 1.0 - high.max()) == pytest.approx(0.1, abs=5e-3)
+    assert low.min() >= MARGIN - 1e-9
+    assert high.max() <= 1.0 - MARGIN + 1e-9
+    assert min(low.min(), 1.0 - high.max()) == pytest.approx(MARGIN, abs=5e-3)
     np.testing.assert_allclose(low + high, 1.0, atol=0.02)
 
 

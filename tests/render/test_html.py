@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import subprocess
+import zlib
 from dataclasses import replace
 from html.parser import HTMLParser
 
@@ -15,6 +16,7 @@ import pytest
 
 from softgm_bench.config import UserError, compose, plain
 from softgm_bench.episodes.trajectory import Trajectory
+from softgm_bench.render.camera import direction
 from softgm_bench.render.html import ATTENTION_BYTES, SCRIPTS, VIEWER, payload, render_page, write_html
 from softgm_bench.rod.parameters import RodParameters
 
@@ -102,7 +104,9 @@ def episode() -> Trajectory:
 
 
 def unpacked(packed: dict) -> np.ndarray:
-    stored = np.frombuffer(base64.b64decode(packed["data"]), STORED[packed["type"]]).reshape(packed["shape"])
+    stored = np.frombuffer(zlib.decompress(base64.b64decode(packed["data"])), STORED[packed["type"]]).reshape(
+        packed["shape"]
+    )
     return packed["offset"] + packed["scale"] * stored.astype(np.float64)
 
 
@@ -201,11 +205,10 @@ def test_numbers_that_are_not_finite_are_refused():
 
 @pytest.mark.parametrize("obstacles", [0, 2, 15])
 def test_the_page_looks_from_where_a_still_is_taken(obstacles):
-    still = pytest.importorskip("softgm_bench.render.still", reason="stills need Pillow")
     post = an_episode()
     seen = replace(post, cylinders={name: values.repeat(obstacles, axis=0) for name, values in post.cylinders.items()})
     camera = carried(render_page(seen))["camera"]
-    assert (camera["azimuth"], camera["elevation"]) == pytest.approx(still.direction(seen, still.Look()), abs=1e-3)
+    assert (camera["azimuth"], camera["elevation"]) == pytest.approx(direction(seen), abs=1e-3)
 
 
 # the page as a file
@@ -227,7 +230,7 @@ def test_a_page_of_2000_steps_with_every_bin_sensed_is_below_five_and_thins_out_
     assert len(text) < 5_000_000
     stages = carried(text)["attention"]
     assert stages["stage1"]["every"] > 1
-    size = sum(len(base64.b64decode(stage["weight"]["data"])) for stage in stages.values())
+    size = sum(unpacked(stage["weight"]).size for stage in stages.values())
     assert 0.3 * ATTENTION_BYTES < size <= ATTENTION_BYTES
 
 
@@ -239,14 +242,15 @@ def test_a_folder_that_cannot_be_made_is_one_clear_line(tmp_path, episode):
 
 def test_title_caption_and_labels_cannot_break_out_of_the_page():
     evil = "</script></title><script>alert('{{episode}}')</script>&amp;"
-    parser = Tags(render_page(an_episode(label=evil), title=evil, caption=evil))
+    parser = Tags(render_page(an_episode(label=evil, seed=evil)))
     assert [tag for tag, _ in parser.tags].count("script") == 2
-    assert parser.heading == evil
+    assert parser.heading == f"structured · {evil}"
     assert carried(render_page(an_episode(label=evil)))["label"] == evil
 
 
 def test_the_page_names_no_address_and_loads_nothing(episode):
-    text = render_page(episode)
+    # three.js creates its own canvas by the name of a namespace, which is no address that anything is loaded from
+    text = render_page(episode).replace('createElementNS("http://www.w3.org/1999/xhtml"', "", 1)
     assert not re.search(r"\b(https?|wss?|ftp)://|\bimport\s*\(|fetch\s*\(|XMLHttpRequest|@import|url\(", text)
     for tag, attributes in Tags(text).tags:
         assert "src" not in attributes, tag
@@ -266,7 +270,24 @@ def test_the_policy_admits_this_script_and_this_style_alone(episode):
 
 
 def test_every_part_of_the_viewer_is_used():
-    assert {path.name for path in VIEWER.iterdir()} == {*SCRIPTS, "page.html", "style.css"}
+    of_three = {"three/LICENSE", "three/README.md"}
+    found = {path.relative_to(VIEWER).as_posix() for path in VIEWER.rglob("*") if path.is_file()}
+    assert found == {*SCRIPTS, *of_three, "page.html", "style.css"}
+
+
+def test_three_js_has_the_stated_version_and_stands_beside_its_licence():
+    (stated,) = set(re.findall(r"three@0\.(\d+)\.\d+", (VIEWER / "three/README.md").read_text()))
+    assert f'revision:"{stated}"' in (VIEWER / "three/three.min.js").read_text()
+    licence = (VIEWER / "three/LICENSE").read_text()
+    assert "The MIT License" in licence
+    assert "three.js authors" in licence
+
+
+def test_three_js_holds_what_the_page_uses_and_nothing_else():
+    exported = re.findall(r"export \{(.*?)\}", (VIEWER / "three/README.md").read_text(), re.DOTALL)
+    named = set(re.findall(r"\w+", " ".join(exported)))
+    own = "".join((VIEWER / name).read_text() for name in SCRIPTS[1:])
+    assert named == set(re.findall(r"THREE\.(\w+)", own)) | {"CatmullRomCurve3", "Color", "Vector3"}
 
 
 # the page's own reading, in node
@@ -290,17 +311,19 @@ def test_the_script_is_valid_javascript(tmp_path, episode):
 
 def test_the_page_reads_what_was_recorded(tmp_path, episode):
     """Of a step: nodes, distance, return, mean attention, sensed bins; between steps the tip moves on smoothly."""
-    parts = "".join((VIEWER / name).read_text() for name in ("data.js", "math.js", "rod.js"))
+    parts = "".join((VIEWER / name).read_text() for name in ("three/three.min.js", "episode.js"))
     harness = """
     const page = require("fs").readFileSync(process.argv[2], "utf8");
     globalThis.document = { getElementById: () => ({ textContent: page }) };
-    const e = readEpisode();
-    const edges = [...Array(e.agents).keys()].map((a) => e.slots.map((_, s) => e.edge(12, a, s)));
-    console.log(JSON.stringify({ at: [...rodAt(e, 12).position], end: [...rodAt(e, e.steps).position],
-      radius: [...rodAt(e, 12).radius], distance: [...e.distance], returned: [...e.returned], edges,
-      tip: nodeAt(e, e.nodes - 1, 12.5), mean: weightsAt(e.attention.stage1, 12, null, null),
-      one: weightsAt(e.attention.stage2, 12, 1, 2),
-      rings: skin(rodAt(e, 12), e.elements).texture.every(Number.isFinite) }));
+    readEpisode().then((e) => {
+      const edges = count(e.agents).map((a) => e.slots.map((_, s) => e.edge(12, a, s)));
+      const at = (time) => rodAt(e, time).map((node) => [...node.centre]);
+      console.log(JSON.stringify({ at: at(12), end: at(e.steps), tip: at(12.5)[e.nodes - 1],
+        radius: rodAt(e, 12).map((node) => node.radius), contact: rodAt(e, 12).map((node) => node.contact),
+        frames: rodAt(e, 12).map((node) => [[...node.first], [...node.second], [...node.tangent]]),
+        distance: e.distance, returned: e.returned, edges, mean: weightsAt(e.attention.stage1, 12, null, null),
+        one: weightsAt(e.attention.stage2, 12, 1, 2) }));
+    });
     """
     (tmp_path / "read.js").write_text(parts + harness)
     (tmp_path / "episode.json").write_text(json.dumps(payload(episode)))
@@ -308,7 +331,15 @@ def test_the_page_reads_what_was_recorded(tmp_path, episode):
     nodes = episode.position.transpose(0, 2, 1)
     np.testing.assert_allclose(np.reshape(found["at"], (-1, 3)), nodes[12], atol=4e-5)
     np.testing.assert_allclose(np.reshape(found["end"], (-1, 3)), nodes[-1], atol=4e-5)
-    np.testing.assert_allclose(found["radius"], episode.radius()[12], atol=1e-5)
+    radius = episode.radius()[12]
+    at_nodes = 0.5 * (np.append(radius[0], radius) + np.append(radius, radius[-1]))
+    np.testing.assert_allclose(found["radius"], at_nodes, atol=1e-5)
+    np.testing.assert_allclose(found["contact"], episode.contact[12], atol=1e-12)
+    frames = np.array(found["frames"])
+    np.testing.assert_allclose(
+        frames @ frames.transpose(0, 2, 1), np.tile(np.eye(3), (len(nodes[12]), 1, 1)), atol=1e-6
+    )
+    np.testing.assert_allclose(frames[:, 0], np.tile([0.0, 1.0, 0.0], (len(nodes[12]), 1)), atol=1e-2)
     distance = np.linalg.norm(nodes[:, -1] - episode.target, axis=-1)
     np.testing.assert_allclose(found["distance"], distance, atol=4e-5)
     np.testing.assert_allclose(found["returned"], [0.0, *np.cumsum(episode.reward, dtype=np.float64)], atol=1e-6)
@@ -323,7 +354,6 @@ def test_the_page_reads_what_was_recorded(tmp_path, episode):
     for edge in found["one"]:
         weight = episode.attention["stage2"][12, 1, 2, edge["receiver"], edge["source"]]
         assert edge["weight"] == pytest.approx(weight, abs=0.51 / 255)
-    assert found["rings"]
 
 
 # the page in a browser
@@ -336,7 +366,7 @@ def browse(page: str, *options: str) -> subprocess.CompletedProcess:
         pytest.skip("no Chromium: set CHROME to its executable or put it on the PATH")
     sandbox = ["--no-sandbox"] if hasattr(os, "geteuid") and os.geteuid() == 0 else []
     common = ["--headless", "--disable-dev-shm-usage", "--hide-scrollbars", "--enable-logging=stderr"]
-    size = ["--window-size=900,600", "--virtual-time-budget=3000"]
+    size = ["--window-size=900,600", "--virtual-time-budget=8000"]
     command = [browser, *common, *sandbox, *size, *options, page]
     return subprocess.run(command, capture_output=True, text=True, timeout=240)
 

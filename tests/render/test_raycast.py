@@ -4,7 +4,7 @@ from arms import bending_arm
 
 from softgm_bench.render import raycast
 from softgm_bench.render.camera import look_at
-from softgm_bench.render.scene import Parts, Stage
+from softgm_bench.render.scene import Parts, Stage, round_cone
 from softgm_bench.render.shading import MARK, OTHER
 
 RED, BLUE = np.array([0.6, 0.05, 0.05]), np.array([0.05, 0.05, 0.6])
@@ -16,10 +16,10 @@ def draw(*spheres, camera=CAMERA):
     stage = Stage(bending_arm())
     parts = Parts()
     for centre, radius, colour, opacity, owner in spheres:
-        row = parts.paint(colour, opacity)
-        parts.add(np.array(centre, dtype=float), radius, np.array(centre, dtype=float), radius, row, owner)
-    parts.block(np.full(3, 50.0), 0.1, np.full(3, 50.0), 0.1)
-    return raycast.render(stage._finish(parts)._replace(floor=-100.0), camera).astype(int)
+        parts.add(round_cone(centre, radius, centre, radius), parts.paint(colour, opacity), owner)
+    parts.block(round_cone(np.full(3, 50.0), 0.1, np.full(3, 50.0), 0.1))
+    drawing = parts.drawing(stage.light, stage.floor, stage.base_length)
+    return raycast.render(drawing._replace(floor=-100.0), camera).astype(int)
 
 
 def reddish(image):

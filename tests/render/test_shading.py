@@ -3,7 +3,7 @@ import pytest
 from arms import bending_arm
 
 from softgm_bench.render.grid import make_grid
-from softgm_bench.render.scene import Parts, Stage
+from softgm_bench.render.scene import Parts, Stage, round_cone
 from softgm_bench.render.shading import CYLINDER, OCCLUSION_REACH, lit_part, open_part, smooth, texture_at
 
 PALE = np.array([0.5, 0.5, 0.5])
@@ -13,10 +13,10 @@ def drawing_of(*blockers):
     """A drawing with nothing but blockers: (start, end, radius, owner)."""
     stage = Stage(bending_arm())
     parts = Parts()
-    parts.add(np.zeros(3), 0.1, np.zeros(3), 0.1, parts.paint(PALE))
+    parts.add(round_cone(np.zeros(3), 0.1, np.zeros(3), 0.1), parts.paint(PALE))
     for start, end, radius, owner in blockers:
-        parts.block(np.array(start, dtype=float), radius, np.array(end, dtype=float), radius, owner)
-    return stage._finish(parts)
+        parts.block(round_cone(start, radius, end, radius), owner)
+    return parts.drawing(stage.light, stage.floor, stage.base_length)
 
 
 def test_a_sphere_darkens_the_point_behind_it_alone():

@@ -5,7 +5,7 @@ import pytest
 from arms import STEPS, bending_arm
 from PIL import Image
 
-from softgm_bench.render.still import Look, Studio
+from softgm_bench.render.still import PictureSettings, Studio
 from softgm_bench.render.video import LONGEST, animated, moments, mp4, natural_speed, pictures
 
 av = pytest.importorskip("av")
@@ -13,7 +13,7 @@ av = pytest.importorskip("av")
 
 @pytest.fixture(scope="module")
 def frames():
-    studio = Studio(bending_arm(), Look(width=80, height=60, text=True))
+    studio = Studio(bending_arm(), PictureSettings(width=80, height=60, text=True))
     return list(pictures(studio, np.array([0.0, 2.0, 4.0, 6.0, 6.0]), 1.0, threads=2))
 
 
@@ -57,7 +57,7 @@ def test_an_animated_picture_has_the_frames_and_repeats(frames, kind):
 
 
 def test_threads_and_company_change_no_pixel(frames):
-    studio = Studio(bending_arm(), Look(width=80, height=60, text=True))
+    studio = Studio(bending_arm(), PictureSettings(width=80, height=60, text=True))
     np.testing.assert_array_equal(frames[2], studio.picture(4.0))
     np.testing.assert_array_equal(frames[4], frames[3])
     (alone,) = pictures(studio, np.array([2.0]), 1.0, threads=1)

@@ -97,13 +97,12 @@ class _Film:
     def picture(self) -> Array:
         """The last state, ``(height, width, 3)`` uint8."""
         try:
-            from softgm_bench.render.still import Look, Studio
+            from softgm_bench.render.still import PictureSettings, Studio
         except ImportError as error:
             raise ImportError("rendering is not installed: pip install 'softgm-bench[render]'") from error
         trajectory = self._trajectory()
-        studio = Studio(
-            trajectory, Look(WIDTH, HEIGHT, distance=VIEW_DISTANCE * self._arm.backend.parameters.base_length)
-        )
+        distance = VIEW_DISTANCE * self._arm.backend.parameters.base_length
+        studio = Studio(trajectory, PictureSettings(WIDTH, HEIGHT, distance=distance))
         if self._camera is None:
             self._camera = studio.camera
         studio.camera = self._camera

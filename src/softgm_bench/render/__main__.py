@@ -32,13 +32,13 @@ if TYPE_CHECKING:
     from softgm_bench.episodes.trajectory import Trajectory
 
 KINDS = (".png", ".mp4", ".webp", ".gif", ".html")
-LARGEST = 4096  # pixels
+RANGES = {"width": (16, 4096), "height": (16, 4096), "fps": (1, 120), "elevation": (-89, 89), "azimuth": (-360, 360)}
 RECORDING = ("seed", "episode", "episodes", "horizon", "deterministic")
 
 
 @dataclass
 class Options:
-    """The command's settings; None: what the text above says."""
+    """The command's settings; where one is None, the text above says what happens."""
 
     out: str = ""
     seed: int | None = None
@@ -69,21 +69,22 @@ def main(arguments: list[str]) -> None:
     source, options, overrides = command.parse(
         arguments, Options, "policy, checkpoint, run folder or recorded episode", others=True
     )
-    files = _files(options)
+    files = [Path(name) for name in options.out.split(",") if name]
     _check(options, files)
     from softgm_bench.episodes import recording  # late: what is refused should not wait
     from softgm_bench.episodes import trajectory as episodes
     from softgm_bench.runs.machine import set_threads
 
     set_threads(options.threads)  # as an evaluation does: rounding depends on it
-    if source.suffix == ".npz":
-        given = [name for name in RECORDING if getattr(options, name) is not None]
-        if given:
-            raise UserError(f"{given[0]}: {source} is recorded already; name a policy to record another episode")
-    page = any(file.suffix == ".html" for file in files)
     chosen = {name: getattr(options, name) for name in RECORDING if getattr(options, name) is not None}
+    if source.suffix == ".npz" and chosen:
+        raise UserError(f"{min(chosen)}: {source} is recorded already; name a policy to record another episode")
+    page = any(file.suffix == ".html" for file in files)
     trajectory = recording.record_or_load(source, attention=options.attention or page, overrides=overrides, **chosen)
-    _check_against(trajectory, options)
+    if options.step is not None and options.step > trajectory.steps:
+        raise UserError(f"step is {options.step:g}: this episode has steps 0 to {trajectory.steps}")
+    if options.attention and not trajectory.attention:
+        raise UserError("attention: this episode has none; its policy has no attention, or it was recorded without")
     if options.save:
         episodes.save(trajectory, Path(options.save))
     for file in files:
@@ -91,77 +92,56 @@ def main(arguments: list[str]) -> None:
         print(f"{episodes.describe(trajectory.info)}: {file}")
 
 
-def _files(options: Options) -> list[Path]:
-    files = [Path(name) for name in options.out.split(",") if name]
-    if not files:
-        raise UserError(f"out: name a file that ends in {', '.join(KINDS)}")
-    for file in files:
-        if file.suffix not in KINDS:
-            raise UserError(f"{file}: its name must end in one of {', '.join(KINDS)}")
-    return files
-
-
 def _check(options: Options, files: list[Path]) -> None:
+    wrong = [f"{file}: its name must end in one of" for file in files if file.suffix not in KINDS]
+    if wrong or not files:
+        raise UserError(f"{wrong[0] if wrong else 'out: name a file that ends in'} {', '.join(KINDS)}")
     kinds = {file.suffix for file in files}
-    for name, low, high in (("width", 16, LARGEST), ("height", 16, LARGEST), ("fps", 1, 120)):
-        if not low <= getattr(options, name) <= high:
-            raise UserError(f"{name} is {getattr(options, name)}: it must be from {low} to {high}")
-        if name != "fps" and ".mp4" in kinds and getattr(options, name) % 2:
-            raise UserError(f"{name} is {getattr(options, name)}: an MP4 video needs an even number")
+    for name, (low, high) in RANGES.items():
+        value = getattr(options, name)
+        if value is not None and not low <= value <= high:
+            raise UserError(f"{name} is {value}: it must be from {low} to {high}")
+        if name in ("width", "height") and ".mp4" in kinds and value % 2:
+            raise UserError(f"{name} is {value}: an MP4 video needs an even number")
     for name in ("speed", "distance", "threads"):
         value = getattr(options, name)
         if value is not None and not 0.0 < value < float("inf"):
             raise UserError(f"{name} is {value}: it must be above 0")
     if options.step is not None and not 0.0 <= options.step < float("inf"):
         raise UserError(f"step is {options.step:g}: it must be a control step from 0")
-    if options.elevation is not None and not -89.0 <= options.elevation <= 89.0:
-        raise UserError(f"elevation is {options.elevation}: it must be from -89 to 89")
-    if options.azimuth is not None and not abs(options.azimuth) <= 360.0:
-        raise UserError(f"azimuth is {options.azimuth}: it must be from -360 to 360")
     if options.save is not None and Path(options.save).suffix != ".npz":
         raise UserError(f"{options.save}: a trajectory's file ends in .npz")
-    needed = {"PIL": kinds - {".html"}, "av": kinds & {".mp4"}}
-    for module, of in needed.items():
-        if of and importlib.util.find_spec(module) is None:
-            raise UserError(f"{min(of)}: {module} is not installed; pip install 'softgm-bench[render]'")
-
-
-def _check_against(trajectory: "Trajectory", options: Options) -> None:
-    if options.step is not None and options.step > trajectory.steps:
-        raise UserError(f"step is {options.step:g}: this episode has steps 0 to {trajectory.steps}")
-    if options.attention and not trajectory.attention:
-        raise UserError("attention: this episode has none; its policy has no attention, or it was recorded without")
+    for module, needing in {"PIL": kinds - {".html"}, "av": kinds & {".mp4"}}.items():
+        if needing and importlib.util.find_spec(module) is None:
+            raise UserError(f"{min(needing)}: {module} is not installed; pip install 'softgm-bench[render]'")
 
 
 def _write(trajectory: "Trajectory", options: Options, file: Path) -> None:
     if file.suffix == ".html":
-        from softgm_bench.render.html import default_camera, write_html
+        from softgm_bench.render.html import write_html
 
-        chosen = {name: getattr(options, name) for name in ("azimuth", "elevation")}
-        camera = default_camera(trajectory) | {name: value for name, value in chosen.items() if value is not None}
-        write_html(trajectory, file, camera=camera)
+        write_html(trajectory, file, azimuth=options.azimuth, elevation=options.elevation)
         return
+    from softgm_bench.render import video
+    from softgm_bench.render.still import PictureSettings, Studio, png
     from softgm_bench.storage.files import write_where_asked
 
-    content = _draw(trajectory, options, file.suffix)
-    write_where_asked(file, content)
-
-
-def _draw(trajectory: "Trajectory", options: Options, kind: str) -> bytes:
-    from softgm_bench.render import video
-    from softgm_bench.render.still import Look, Studio, png
-
-    text = kind != ".png" if options.text is None else options.text
+    still = file.suffix == ".png"
+    text = not still if options.text is None else options.text
     names = ("width", "height", "azimuth", "elevation", "distance", "attention")
     settings: dict[str, Any] = {name: getattr(options, name) for name in names}
-    studio = Studio(trajectory, Look(text=text, **settings))
-    if kind == ".png":
-        return png(studio.picture(float(trajectory.steps) if options.step is None else options.step))
+    studio = Studio(trajectory, PictureSettings(text=text, **settings))
+    if still:
+        write_where_asked(file, png(studio.picture(float(trajectory.steps) if options.step is None else options.step)))
+        return
     control_dt = studio.stage.control_dt
     speed = options.speed or video.natural_speed(trajectory.steps * control_dt)
     times = video.moments(trajectory.steps, control_dt, options.fps, speed)
     frames = video.pictures(studio, times, speed, options.threads)
-    return video.mp4(frames, options.fps) if kind == ".mp4" else video.animated(frames, options.fps, kind[1:])
+    mp4 = file.suffix == ".mp4"
+    write_where_asked(
+        file, video.mp4(frames, options.fps) if mp4 else video.animated(frames, options.fps, file.suffix[1:])
+    )
 
 
 if __name__ == "__main__":

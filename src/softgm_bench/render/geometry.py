@@ -40,18 +40,9 @@ def hit_round_cone(ox, oy, oz, dx, dy, dz, cones, n):
     Lateral surface of the cone that is tangent to both spheres where the point of contact lies between them, otherwise
     the nearer sphere (Quilez, "Intersectors", rounded cone).
 
-    Args:
-        ox: origin of the ray, with oy and oz.
-        oy: see ox.
-        oz: see ox.
-        dx: unit direction, with dy and dz.
-        dy: see dx.
-        dz: see dx.
-        cones: ``(P, 8)``: centre and radius of one sphere, then of the other.
-        n: which of them; a row of its own would have its references counted, at the cost of the intersection.
-
-    Returns:
-        Distance or ``MISS``; position along the axis from 0 at the first sphere to 1.
+    The ray goes from o along the unit direction d. Row n of ``cones``, ``(P, 8)``, holds centre and radius of both
+    spheres; handing over the row alone would count its references, at the cost of the intersection. Returns the
+    distance or ``MISS``, and the position along the axis, from 0 at the first sphere to 1.
     """
     ra, rb = cones[n, 3], cones[n, 7]
     ux, uy, uz = cones[n, 4] - cones[n, 0], cones[n, 5] - cones[n, 1], cones[n, 6] - cones[n, 2]

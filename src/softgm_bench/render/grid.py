@@ -1,7 +1,7 @@
-"""Which round cones can matter where: lists of them per cell of a regular grid; compiled functions.
+"""Lists of the round cones that can matter per cell of a regular grid; compiled functions.
 
-The same lists serve three questions: what a pixel's ray may hit (tiles of the image), what may shade a point (cells of
-the plane across the light), and what is near a point (cells in space).
+They serve three questions: what a pixel's ray may hit (tiles of the image), what may shade a point (cells of the plane
+across the light), and what is near a point (cells in space).
 """
 
 from typing import Any, NamedTuple
@@ -13,34 +13,20 @@ from softgm_bench.render.geometry import jit
 
 
 class Grid(NamedTuple):
-    """Lists of round cones; cell (i, j, k) has the number ``(k * shape[1] + j) * shape[0] + i``.
+    """Lists of round cones; cell (i, j, k) has the number ``(k * shape[1] + j) * shape[0] + i``."""
 
-    Attributes:
-        origin: of cell (0, 0, 0), ``(3,)``.
-        cell: edge of a cell.
-        shape: cells along each axis, ``(3,)`` int64.
-        first: where each cell's list begins in ``items``, ``(cells + 1,)`` int64.
-        items: numbers of round cones, ascending within a cell.
-    """
-
-    origin: NDArray[np.float64]
-    cell: float
-    shape: NDArray[np.int64]
-    first: NDArray[np.int64]
-    items: NDArray[np.int64]
+    origin: NDArray[np.float64]  # of cell (0, 0, 0), (3,)
+    cell: float  # edge of a cell
+    shape: NDArray[np.int64]  # cells along each axis, (3,)
+    first: NDArray[np.int64]  # index in items at which each cell's list begins, (cells + 1,)
+    items: NDArray[np.int64]  # numbers of round cones, ascending within a cell
 
 
 def make_grid(low: NDArray[Any], high: NDArray[Any], cell: float, bounds: tuple[Any, Any] | None = None) -> Grid:
-    """Sort boxes into cells.
+    """Sort boxes between corners ``low`` and ``high``, ``(n, 3)``, into the lists of all cells that they meet.
 
-    Args:
-        low: lower corners of the round cones' boxes, ``(n, 3)``.
-        high: upper corners.
-        cell: edge of a cell, enlarged where more than about a million would be needed.
-        bounds: lower and upper corner of what the grid has to cover, where boxes are cut; all boxes by default.
-
-    Returns:
-        Lists in which every box appears in every cell that it meets.
+    The edge ``cell`` is enlarged where more than about a million cells would be needed. Boxes are cut at ``bounds``,
+    the lower and upper corner of what the grid has to cover; by default it covers all of them.
     """
     lowest, highest = (low.min(axis=0), high.max(axis=0)) if bounds is None else bounds
     origin = np.asarray(lowest, dtype=np.float64)

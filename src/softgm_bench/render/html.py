@@ -1,8 +1,8 @@
-"""One episode as one interactive HTML file: no network, no third-party code, the same bytes for the same input.
+"""One episode as one interactive HTML file that needs no network; the same input gives the same bytes.
 
-The page in ``viewer/`` draws with WebGL 2, or on a 2D canvas where that is missing. Its scripts are joined in the order
-of ``SCRIPTS`` and put into the page together with the style and the episode; a Content-Security-Policy admits that one
-script and that one style by their hashes and nothing else.
+The page in ``viewer/`` draws with three.js, or simply on a 2D canvas where WebGL 2 is missing. Its scripts are joined
+in the order of ``SCRIPTS`` and put into the page together with the style and the episode; a Content-Security-Policy
+admits that one script and that one style by their hashes and nothing else.
 """
 
 import base64
@@ -10,105 +10,75 @@ import hashlib
 import json
 import math
 import re
+import zlib
 from html import escape
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
 from softgm_bench.episodes.trajectory import Trajectory
 from softgm_bench.render import style
-from softgm_bench.render.camera import FIELD_OF_VIEW, MANY, default_direction
+from softgm_bench.render.camera import FIELD_OF_VIEW, direction
+from softgm_bench.render.scene import Stage
 from softgm_bench.storage.files import write_where_asked
 
 VIEWER = Path(__file__).with_name("viewer")
-SCRIPTS = (
-    "data.js",
-    "math.js",
-    "colours.js",
-    "camera.js",
-    "rod.js",
-    "marks.js",
-    "shaders.js",
-    "gl.js",
-    "flat.js",
-    "plots.js",
-    "matrix.js",
-    "main.js",
-)
+PARTS = "three/three.min episode colours view arm edges scene plots matrix main"
+SCRIPTS = [f"{name}.js" for name in PARTS.split()]
 COLOURS = {
-    "arm": style.ARM,
-    "ring": style.RING,
-    "tip": style.TIP,
-    "touch": style.TOUCH,
-    "column": style.COLUMN,
-    "discovered": style.DISCOVERED,
-    "fresh": style.NEW,
-    "target": style.TARGET,
-    "reached": style.REACHED,
-    "attention": style.ATTENTION,
-    "path": style.PATH,
-    "pedestal": style.PEDESTAL,
+    name.lower(): value for name, value in vars(style).items() if name.isupper() and isinstance(value, str | tuple)
 }
+CYLINDER = ("start", "axis", "length", "radius")
 ATTENTION_BYTES = 1_500_000  # of both stages together; a longer episode keeps the weights of every k-th step
 
 
-def write_html(
-    trajectory: Trajectory,
-    path: Path,
-    *,
-    title: str | None = None,
-    caption: str | None = None,
-    camera: dict[str, float] | None = None,
-) -> None:
+def write_html(trajectory: Trajectory, path: Path, **view: float | None) -> None:
     """Write an episode as a page that opens in any browser, also from disk.
 
     Args:
         trajectory: the episode.
         path: of the file.
-        title: heading; by default the task and the algorithm's label.
-        caption: line below it; by default where the policy and the episode come from.
-        camera: ``azimuth``, ``elevation`` and ``fov``, degrees, as in ``softgm_bench.render.camera``.
+        view: ``azimuth`` and ``elevation`` of the first view, degrees; by default a still's.
 
     Raises:
         UserError: the file cannot be written.
     """
-    text = render_page(trajectory, title=title, caption=caption, camera=camera)
-    write_where_asked(path, text.encode())
+    write_where_asked(path, render_page(trajectory, **view).encode())
 
 
-def render_page(
-    trajectory: Trajectory,
-    *,
-    title: str | None = None,
-    caption: str | None = None,
-    camera: dict[str, float] | None = None,
-) -> str:
+def render_page(trajectory: Trajectory, **view: float | None) -> str:
     """The text that ``write_html`` writes; arguments as there."""
+    azimuth, elevation = direction(trajectory, **view)
+    camera = {"azimuth": round(azimuth, 3), "elevation": elevation, "fov": FIELD_OF_VIEW}
+    info = trajectory.info
+    learnt = f"policy after {info['frames']:,} frames, " if info.get("frames") else ""
     sheet = _part("style.css")
-    script = '"use strict";\n(() => {\n' + "".join(_part(name) for name in SCRIPTS) + "})();\n"
+    script = '"use strict";\n(() => {\n' + "".join(map(_part, SCRIPTS)) + "})();\n"
     parts = {
-        "title": escape(title or _title(trajectory)),
-        "caption": escape(caption or _caption(trajectory)),
+        "title": escape(f"{trajectory.config['task']['name']} · {info['label']}"),
+        "caption": escape(f"{learnt}seed {info.get('seed', '?')}, episode {info.get('episode', '?')}"),
         "style": sheet,
         "script": script,
         "style_hash": _source_hash(sheet),
         "script_hash": _source_hash(script),
-        "episode": _json(payload(trajectory) | {"camera": camera or default_camera(trajectory)}),
+        "episode": _json(payload(trajectory) | {"camera": camera}),
     }
     # one pass, so that braces in what is put in are left alone
     return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], _part("page.html"))
 
 
 def payload(trajectory: Trajectory) -> dict[str, Any]:
-    """What the page's script reads: plain values, and arrays as ``_array`` packs them.
+    """The episode as the page's script reads it: plain values, and arrays as ``_array`` packs them.
 
     Positions are rounded to 1/65535 of the largest extent over the episode along any axis (0.03 mm for 2 m), radii to
     1/255 of their range, d1's components to 1/127, attention weights to 1/255.
     """
     task, rod = trajectory.config["task"], trajectory.config["rod"]
-    slots = _slots(trajectory)
+    slots, stage = _slots(trajectory), Stage(trajectory)
+    extent, cylinders = stage.extent(), trajectory.cylinders
     packed = {
         "position": _rounded(trajectory.position.transpose(0, 2, 1), np.uint16),
         "normal": _array(np.rint(127.0 * trajectory.director[:, 0].transpose(0, 2, 1)), np.int8, scale=1.0 / 127.0),
@@ -122,7 +92,6 @@ def payload(trajectory: Trajectory) -> dict[str, Any]:
     if np.any(trajectory.tip_force):
         packed["force"] = _array(trajectory.tip_force, np.float32)
     return {
-        "format": 1,
         "task": task["name"],
         "label": str(trajectory.info["label"]),
         "steps": trajectory.steps,
@@ -135,8 +104,10 @@ def payload(trajectory: Trajectory) -> dict[str, Any]:
         "success": bool(trajectory.success),
         "diverged": bool(trajectory.diverged),
         "target": _numbers(trajectory.target),
-        "cylinders": _cylinders(trajectory.cylinders),
-        "wall": len(trajectory.cylinders["length"]) >= MANY,
+        "cylinders": [_numbers(row) for row in np.column_stack([cylinders[name] for name in CYLINDER])],
+        "wall": stage.wall,
+        "floor": round(float(extent[:, 2].min()), 6),
+        "extent": [_numbers(extent[corner]) for corner in ConvexHull(extent).vertices],
         "slots": slots,
         "terms": list(trajectory.reward_terms),
         "colours": COLOURS,
@@ -145,33 +116,8 @@ def payload(trajectory: Trajectory) -> dict[str, Any]:
     }
 
 
-def default_camera(trajectory: Trajectory) -> dict[str, float]:
-    """Where the page looks from at first, as stills do; it moves so far away that the scene fits its window."""
-    azimuth, elevation = default_direction(len(trajectory.cylinders["length"]), trajectory.target)
-    return {"azimuth": round(azimuth, 3), "elevation": elevation, "fov": FIELD_OF_VIEW}
-
-
-def _title(trajectory: Trajectory) -> str:
-    return f"{trajectory.config['task']['name']} · {trajectory.info['label']}"
-
-
-def _caption(trajectory: Trajectory) -> str:
-    info = trajectory.info
-    learnt = f"policy after {info['frames']:,} frames, " if info.get("frames") else ""
-    return f"{learnt}seed {info.get('seed', '?')}, episode {info.get('episode', '?')}"
-
-
-# the scene
-
-
 def _numbers(values: NDArray) -> list[float]:
     return [round(float(value), 6) for value in values]
-
-
-def _cylinders(cylinders: dict[str, NDArray]) -> list[list[float]]:
-    """Start, axis, length, radius of each."""
-    columns = [cylinders["start"], cylinders["axis"], cylinders["length"][:, None], cylinders["radius"][:, None]]
-    return [_numbers(row) for row in np.concatenate(columns, axis=1)]
 
 
 def _slots(trajectory: Trajectory) -> list[dict[str, Any]]:
@@ -180,33 +126,23 @@ def _slots(trajectory: Trajectory) -> list[dict[str, Any]]:
     used = int(active[-1].sum())  # slots are filled from the front and never emptied
     half_bin = 0.5 * trajectory.config["task"]["bin_length"]
     slots = []
-    for slot in range(used):
-        row = trajectory.observation["slots/descriptor"][-1, slot]
-        radius, length, middle = (float(value) for value in row[6:])
-        slots.append(
-            {
-                "step": int(active[:, slot].argmax()),
-                "centre": _numbers(row[:3]),
-                "axis": _numbers(row[3:6]),
-                "radius": round(radius, 6),
-                "half": round(min(half_bin, length * (1.0 - middle)), 6),  # a cylinder's last bin may be shorter
-            }
-        )
+    for slot, row in enumerate(trajectory.observation["slots/descriptor"][-1, :used]):
+        radius, length, middle = _numbers(row[6:])
+        half = round(min(half_bin, length * (1.0 - middle)), 6)  # a cylinder's last bin may be shorter
+        place = {"centre": _numbers(row[:3]), "axis": _numbers(row[3:6]), "radius": radius, "half": half}
+        slots.append({"step": int(active[:, slot].argmax())} | place)
     return slots
 
 
-# arrays
-
-
 def _array(values: NDArray, dtype: type, *, scale: float = 1.0, offset: float = 0.0) -> dict[str, Any]:
-    """Little-endian bytes in base64; a value is ``offset + scale * stored``."""
+    """Little-endian bytes, compressed and in base64; a value is ``offset + scale * stored``."""
     stored = np.ascontiguousarray(values).astype(np.dtype(dtype).newbyteorder("<"))
     return {
         "type": np.dtype(dtype).name,
         "shape": list(stored.shape),
         "scale": scale,
         "offset": offset,
-        "data": base64.b64encode(stored.tobytes()).decode(),
+        "data": base64.b64encode(zlib.compress(stored.tobytes(), 9)).decode(),
     }
 
 
@@ -248,9 +184,6 @@ def _attention(attention: dict[str, NDArray]) -> dict[str, Any]:
             "weight": _array(weights[::every][step, :, :, receiver, source], np.uint8, scale=1.0 / 255.0),
         }
     return stages
-
-
-# the page
 
 
 def _part(name: str) -> str:

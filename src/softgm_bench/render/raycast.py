@@ -1,13 +1,11 @@
 """From round cones to an image: one ray a pixel, more where neighbouring pixels differ; compiled functions."""
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
-from softgm_bench.render.camera import NEAR, Camera
+from softgm_bench.render.camera import CORNERS, NEAR, Camera
 from softgm_bench.render.geometry import MISS, hit_round_cone, jit
-from softgm_bench.render.grid import Grid, cell_of, make_grid
+from softgm_bench.render.grid import cell_of, make_grid
 from softgm_bench.render.shading import MARK, Drawing, lit_part, open_part, shade, texture_at
 
 TILE = 8.0  # pixels
@@ -15,44 +13,27 @@ LAYERS = 24  # translucent surfaces in front of one another; more are left out
 BACKDROP = (0.905, 0.88, 0.84)  # linear
 HIDDEN = 0.6  # part of its opacity that a mark keeps behind what hides it
 CONTRAST = 0.02  # difference of neighbouring pixels, square root of linear, from which both are looked at again
+MIDDLE = np.full((1, 2), 0.5)  # place of the first ray in a pixel
 # Places of the further rays in a pixel: no two in one row or column.
 ROOKS = np.array([[0, 2], [1, 4], [2, 0], [3, 5], [4, 1], [5, 3]]) / 6.0 + 1.0 / 12.0
 
 
-class View(NamedTuple):
-    """The camera as compiled functions read it."""
-
-    position: NDArray[np.float64]
-    basis: NDArray[np.float64]
-    focal: float
-    width: int
-    height: int
-    tiles: Grid
-
-
 def render(drawing: Drawing, camera: Camera) -> NDArray[np.uint8]:
-    """Draw.
-
-    Args:
-        drawing: everything.
-        camera: outside of all round cones.
-
-    Returns:
-        sRGB image, ``(height, width, 3)``. The same arguments give the same image.
-    """
+    """An sRGB image ``(height, width, 3)``, always the same; the camera is outside of all round cones."""
     low, high = _on_screen(drawing.cone, camera)
     tiles = make_grid(low, high, TILE, ([0.0, 0.0, 0.0], [camera.width - 1.0, camera.height - 1.0, 0.0]))
-    view = View(camera.position, camera.basis, camera.focal, camera.width, camera.height, tiles)
-    return _to_srgb(_draw(drawing, view, ROOKS))
+    image = np.empty((camera.height, camera.width, 3))
+    _draw(drawing, camera, tiles, np.ones(image.shape[:2], dtype=bool), MIDDLE, image)
+    _draw(drawing, camera, tiles, _edges(image), ROOKS, image)
+    return _to_srgb(image)
 
 
 def _on_screen(cone: NDArray[np.float64], camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Boxes in pixels, ``(P, 3)`` each, of the third coordinate 0, around the round cones' pictures.
 
-    The hull of two spheres is inside of the hull of two boxes around them, whose corners are looked at.
+    The hull of two spheres is inside of the hull of two boxes around them, whose corners are projected.
     """
-    corner = np.stack(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [-1.0, 1.0], indexing="ij"), axis=-1).reshape(8, 3)
-    offset = corner @ camera.basis  # boxes along the camera's axes
+    offset = CORNERS @ camera.basis  # boxes along the camera's axes
     ends = cone.reshape(-1, 2, 4)
     points = ends[:, :, None, :3] + ends[:, :, None, 3:] * offset
     pixel, depth = camera.project(points.reshape(len(cone), 16, 3))
@@ -67,76 +48,56 @@ def _to_srgb(image: NDArray[np.float64]) -> NDArray[np.uint8]:
     return _SRGB[(np.clip(image, 0.0, 1.0) * (len(_SRGB) - 1) + 0.5).astype(np.uint16)]
 
 
-def _encoded(levels: int) -> NDArray[np.uint8]:
-    """sRGB values of linear ones from 0 to 1."""
-    value = np.linspace(0.0, 1.0, levels)
-    encoded = np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1.0 / 2.4) - 0.055)
-    return (255.0 * encoded + 0.5).astype(np.uint8)
-
-
-_SRGB = _encoded(1 << 14)
+_LINEAR = np.linspace(0.0, 1.0, 1 << 14)
+_ENCODED = np.where(_LINEAR <= 0.0031308, 12.92 * _LINEAR, 1.055 * _LINEAR ** (1.0 / 2.4) - 0.055)
+_SRGB = (255.0 * _ENCODED + 0.5).astype(np.uint8)
 
 
 @jit
-def _draw(drawing, view, rooks):
-    """Linear image ``(height, width, 3)``: a ray through every pixel's middle, then more where there is an edge."""
-    width, height = view.width, view.height
-    image = np.empty((height, width, 3))
+def _draw(drawing, camera, tiles, chosen, places, image):
+    """Set chosen pixels of a linear image ``(height, width, 3)`` to the mean of rays at places from 0 to 1 in them."""
     depth = np.empty(LAYERS)
     layer = np.empty(LAYERS, np.int64)
     place = np.empty(LAYERS)
-    edge = np.ones((height, width), np.bool_)
-    for sweep in range(2):
-        rays = 1 if sweep == 0 else len(rooks)
-        for j in range(height):
-            for i in range(width):
-                if not edge[j, i]:
-                    continue
-                red, green, blue = 0.0, 0.0, 0.0
-                for k in range(rays):
-                    x, y = (0.5, 0.5) if sweep == 0 else (rooks[k, 0], rooks[k, 1])
-                    r, g, b = _look(drawing, view, i + x, j + y, depth, layer, place)
-                    red, green, blue = red + min(r, 1.0), green + min(g, 1.0), blue + min(b, 1.0)
-                image[j, i, 0], image[j, i, 1], image[j, i, 2] = red / rays, green / rays, blue / rays
-        if sweep == 0:
-            edge = _edges(image)
-    return image
+    rays = len(places)
+    for j in range(camera.height):
+        for i in range(camera.width):
+            if not chosen[j, i]:
+                continue
+            red, green, blue = 0.0, 0.0, 0.0
+            for k in range(rays):
+                r, g, b = _colour_at(drawing, camera, tiles, i + places[k, 0], j + places[k, 1], depth, layer, place)
+                red, green, blue = red + min(r, 1.0), green + min(g, 1.0), blue + min(b, 1.0)
+            image[j, i, 0], image[j, i, 1], image[j, i, 2] = red / rays, green / rays, blue / rays
 
 
-@jit
-def _edges(image):
-    """Pixels that differ from a neighbour, ``(height, width)`` bool."""
-    height, width = image.shape[0], image.shape[1]
-    edge = np.zeros((height, width), np.bool_)
-    for j in range(height):
-        for i in range(width):
-            for di, dj in ((1, 0), (0, 1)):
-                if i + di < width and j + dj < height:
-                    for c in range(3):
-                        one, two = np.sqrt(max(image[j, i, c], 0.0)), np.sqrt(max(image[j + dj, i + di, c], 0.0))
-                        if abs(one - two) > CONTRAST:
-                            edge[j, i] = True
-                            edge[j + dj, i + di] = True
+def _edges(image: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Pixels that differ from a neighbour, ``(height, width)``."""
+    root, edge = np.sqrt(np.maximum(image, 0.0)), np.zeros(image.shape[:2], dtype=bool)
+    below = (np.abs(np.diff(root, axis=0)) > CONTRAST).any(axis=-1)
+    beside = (np.abs(np.diff(root, axis=1)) > CONTRAST).any(axis=-1)
+    for part, differs in ((edge[1:], below), (edge[:-1], below), (edge[:, 1:], beside), (edge[:, :-1], beside)):
+        part |= differs
     return edge
 
 
 @jit
-def _look(drawing, view, x, y, depth, layer, place):
+def _colour_at(drawing, camera, tiles, x, y, depth, layer, place):
     """Linear colour at pixel coordinates (x, y); depth, layer and place are room for translucent surfaces."""
-    across = (x - 0.5 * view.width) / view.focal
-    upward = (0.5 * view.height - y) / view.focal
-    basis = view.basis
+    across = (x - 0.5 * camera.width) / camera.focal
+    upward = (0.5 * camera.height - y) / camera.focal
+    basis = camera.basis
     dx = across * basis[0, 0] + upward * basis[1, 0] + basis[2, 0]
     dy = across * basis[0, 1] + upward * basis[1, 1] + basis[2, 1]
     dz = across * basis[0, 2] + upward * basis[1, 2] + basis[2, 2]
     scale = 1.0 / np.sqrt(dx * dx + dy * dy + dz * dz)
     dx, dy, dz = dx * scale, dy * scale, dz * scale
-    ox, oy, oz = view.position[0], view.position[1], view.position[2]
+    ox, oy, oz = camera.position[0], camera.position[1], camera.position[2]
 
     nearest, solid, solid_place, count = MISS, -1, 0.0, 0
-    cell = cell_of(view.tiles, x, y, 0.0)
-    for k in range(view.tiles.first[cell], view.tiles.first[cell + 1]):
-        n = view.tiles.items[k]
+    cell = cell_of(tiles, x, y, 0.0)
+    for k in range(tiles.first[cell], tiles.first[cell + 1]):
+        n = tiles.items[k]
         t, along = hit_round_cone(ox, oy, oz, dx, dy, dz, drawing.cone, n)
         if t >= nearest and drawing.owner[n] != MARK:
             continue
@@ -151,7 +112,7 @@ def _look(drawing, view, x, y, depth, layer, place):
             count += 1
 
     down = (drawing.floor - oz) / dz if dz < 0.0 and oz > drawing.floor else MISS
-    red, green, blue = _backdrop(x / view.width, y / view.height)
+    red, green, blue = _backdrop(x / camera.width, y / camera.height)
     if solid >= 0 and nearest < down:
         red, green, blue, _ = shade(
             drawing, solid, solid_place, ox + nearest * dx, oy + nearest * dy, oz + nearest * dz, dx, dy, dz

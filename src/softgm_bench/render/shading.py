@@ -20,41 +20,23 @@ AMBIENT = 0.62
 
 
 class Drawing(NamedTuple):
-    """What is drawn, as compiled functions read it: P round cones that are seen, Q that take light from others.
+    """A picture's content for compiled functions: P round cones that are seen, Q that take light from others."""
 
-    Attributes:
-        cone: centre (m) and radius (m) of both spheres, ``(P, 8)``.
-        owner: ``ARM``, ``CYLINDER``, ``OTHER`` or ``MARK``, ``(P,)`` int64.
-        row: of the texture, ``(P,)`` int64.
-        span: texture coordinates, 0 to 1, of both ends, ``(P, 2)``.
-        look: emission and gloss, each 0 to 1, ``(P, 2)``.
-        texture: linear red, green, blue and opacity along each thing, ``(rows, W, 4)``.
-        blocker: as ``cone``, ``(Q, 8)``.
-        blocker_owner: as ``owner``, ``(Q,)``.
-        blocker_strength: part of the light that it takes, ``(Q,)``.
-        in_light: both centres in the light's frame: across, across, towards the light, ``(Q, 6)``.
-        light: rows of the light's frame, the last one towards the light, ``(3, 3)``.
-        fill: direction towards the fill light, ``(3,)``.
-        shadow_grid: boxes in the plane across the light.
-        near_grid: boxes in space, enlarged by ``OCCLUSION_REACH``.
-        floor: height of the floor, m.
-    """
-
-    cone: NDArray[np.float64]
-    owner: NDArray[np.int64]
-    row: NDArray[np.int64]
-    span: NDArray[np.float64]
-    look: NDArray[np.float64]
-    texture: NDArray[np.float64]
-    blocker: NDArray[np.float64]
-    blocker_owner: NDArray[np.int64]
-    blocker_strength: NDArray[np.float64]
-    in_light: NDArray[np.float64]
-    light: NDArray[np.float64]
-    fill: NDArray[np.float64]
-    shadow_grid: Grid
-    near_grid: Grid
-    floor: float
+    cone: NDArray[np.float64]  # centre and radius of both spheres, m, (P, 8)
+    owner: NDArray[np.int64]  # ARM, CYLINDER, OTHER or MARK, (P,)
+    row: NDArray[np.int64]  # of the texture, (P,)
+    span: NDArray[np.float64]  # texture coordinates, 0 to 1, of both ends, (P, 2)
+    shine: NDArray[np.float64]  # emission and gloss, each 0 to 1, (P, 2)
+    texture: NDArray[np.float64]  # linear red, green, blue and opacity along each thing, (rows, W, 4)
+    blocker: NDArray[np.float64]  # as cone, (Q, 8)
+    blocker_owner: NDArray[np.int64]  # as owner, (Q,)
+    blocker_strength: NDArray[np.float64]  # part of the light that it takes, (Q,)
+    in_light: NDArray[np.float64]  # both centres in the light's frame: across, across, towards the light, (Q, 6)
+    light: NDArray[np.float64]  # rows of the light's frame, the last one towards the light, (3, 3)
+    fill: NDArray[np.float64]  # direction towards the fill light, (3,)
+    shadow_grid: Grid  # boxes in the plane across the light
+    near_grid: Grid  # boxes in space, enlarged by OCCLUSION_REACH
+    floor: float  # height, m
 
 
 @jit
@@ -126,17 +108,7 @@ def lit_part(drawing, px, py, pz):
 
 @jit
 def open_part(drawing, px, py, pz, nx, ny, nz):
-    """How much of the ambient light reaches a point with normal n, 0 to 1: arm and cylinders near it take some.
-
-    Args:
-        drawing: everything.
-        px: the point, with py and pz.
-        py: see px.
-        pz: see px.
-        nx: unit normal, with ny and nz.
-        ny: see nx.
-        nz: see nx.
-    """
+    """How much ambient light reaches a point p with unit normal n, 0 to 1: arm and cylinders near it take some."""
     cell = cell_of(drawing.near_grid, px, py, pz)
     if cell < 0:
         return 1.0
@@ -172,7 +144,7 @@ def shade(drawing, n, y, px, py, pz, dx, dy, dz):
     glass = opacity < 0.5  # too faint for the shadows on it to be seen
     if opacity < 0.995:  # as a thin skin: more of it lies in the way of a slanting look
         opacity = 1.0 - (1.0 - opacity) ** min(1.0 / facing, 4.0)
-    glow, gloss = drawing.look[n, 0], drawing.look[n, 1]
+    glow, gloss = drawing.shine[n, 0], drawing.shine[n, 1]
     light = drawing.light[2]
     towards = nx * light[0] + ny * light[1] + nz * light[2]
     key = 0.0

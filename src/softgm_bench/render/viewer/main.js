@@ -2,26 +2,22 @@
 
 const SPEEDS = [0.05, 0.1, 0.25, 0.5, 1, 2, 4, 8, 16];
 
-function main() {
-  const by = (id) => document.getElementById(id);
-  const episode = readEpisode();
+async function main() {
+  const episode = await readEpisode();
   readPaint(episode.colours);
-  const bounds = sceneBounds(episode);
   const canvas = by("scene");
-  const camera = new Camera(episode.camera, bounds.points);
+  const view = new View(canvas, episode, changed);
   const show = { edges: true, actions: true, path: true, labels: true, clear: episode.wall };
   const state = { time: 0, playing: false, speed: 1, theme: readTheme(), choice: { stage: null, layer: null, head: null }, show };
   const hash = new URLSearchParams(location.hash.slice(1));
-  let renderer = chooseRenderer(canvas, episode, bounds, hash.get("renderer") === "2d");
-  let waiting = false;
-  let before = null;
-  let ratio = 1;
+  const flat = hash.get("renderer") === "2d" || !document.createElement("canvas").getContext("webgl2");
+  const scene = flat ? null : new ArmScene(canvas, episode, view);
+  by("notice").hidden = !flat;
+  let [waiting, before, ratio] = [false, null, 1];
 
   function changed() {
-    if (!waiting) {
-      waiting = true;
-      requestAnimationFrame(tick);
-    }
+    if (!waiting) requestAnimationFrame(tick);
+    waiting = true;
   }
 
   function tick(now) {
@@ -37,26 +33,24 @@ function main() {
   }
 
   function draw() {
-    const rod = rodAt(episode, state.time);
-    const frame = {
-      rod,
-      reached: episode.success && state.time >= episode.steps,
-      solids: solidsAt(episode, rod, state.time, bounds, state.theme, show),
-      path: show.path ? pathAt(episode, state.time) : [],
-      edges: show.edges ? edgesAt(episode, rod, state.time, state.theme, state.choice, camera.out) : [],
-    };
-    renderer.draw(frame, camera, state.theme, ratio);
-    drawLabels(by("overlay"), episode, rod, camera, state, ratio);
+    const { theme, time } = state;
+    const rod = rodAt(episode, time);
+    const out = view.camera.position.clone().sub(view.controls.target).normalize();
+    const path = show.path ? pathAt(episode, time) : [];
+    const edges = show.edges ? edgesAt(episode, rod, time, theme, state.choice, out) : [];
+    const context = by("overlay").getContext("2d");
+    context.setTransform(ratio, 0, 0, ratio, 0, 0);
+    context.clearRect(0, 0, view.width, view.height);
+    if (scene) scene.draw(time, rod, [...path, ...edges], theme, show, ratio);
+    else drawFlat(context, episode, rod, view);
+    if (show.labels) drawLabels(context, episode, rod, view);
     readOuts(episode, state);
-    plots.draw();
-    matrix.draw();
+    for (const plot of plots) plot.draw();
   }
 
   function seek(time) {
-    setPlaying(false);
     state.time = clamp(time, 0, episode.steps);
-    speak(episode, state);
-    changed();
+    setPlaying(false);
   }
 
   function setPlaying(playing) {
@@ -71,20 +65,15 @@ function main() {
 
   function resize() {
     ratio = Math.min(window.devicePixelRatio || 1, 2);
-    const [width, height] = [canvas.clientWidth, canvas.clientHeight];
-    for (const one of [canvas, by("overlay")]) {
-      one.width = Math.max(1, Math.round(width * ratio));
-      one.height = Math.max(1, Math.round(height * ratio));
-    }
+    const [width, height] = [Math.max(1, canvas.clientWidth), Math.max(1, canvas.clientHeight)];
+    Object.assign(by("overlay"), { width: Math.round(width * ratio), height: Math.round(height * ratio) });
     const header = document.querySelector("header").offsetHeight;
-    camera.resize(width, height, [Math.min(header + 16, 0.3 * height), 20, 34, 20]);
-    plots.resize();
-    matrix.resize();
-    changed();
+    view.resize(width, height, [Math.min(header + 16, 0.3 * height), 20, 34, 20]);
+    for (const plot of plots) plot.resize();
+    draw();
   }
 
-  const plots = makePlots(episode, state, seek);
-  const matrix = makeMatrix(episode, state, changed);
+  const plots = [...makePlots(episode, state, seek), ...makeMatrix(episode, state, changed)];
 
   by("time").max = episode.steps;
   by("time").addEventListener("input", (event) => seek(Number(event.target.value)));
@@ -92,49 +81,19 @@ function main() {
   chooseSpeeds(by("speed"), episode, state);
   for (const name of Object.keys(show)) {
     by(`s-${name}`).checked = show[name];
-    by(`s-${name}`).addEventListener("change", (event) => {
-      show[name] = event.target.checked;
-      changed();
-    });
+    by(`s-${name}`).addEventListener("change", (event) => changed((show[name] = event.target.checked)));
   }
   const views = { home: [], front: [Math.PI, 0.12], side: [-Math.PI / 2, 0.12], top: [-Math.PI / 2, 1.5] };
-  for (const [name, angles] of Object.entries(views)) {
-    by(`view-${name}`).addEventListener("click", () => {
-      camera.reset(...angles);
-      changed();
-    });
-  }
-  listenForCamera(canvas, camera, changed);
-  listenForKeys({ episode, state, camera, seek, setPlaying, changed });
-  canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
-  canvas.addEventListener("webglcontextrestored", () => {
-    renderer = new GlRenderer(canvas, episode, bounds);
-    changed();
-  });
+  for (const [name, angles] of Object.entries(views)) by(`view-${name}`).addEventListener("click", () => view.reset(...angles));
+  listenForKeys({ episode, state, view, seek, setPlaying });
+  canvas.addEventListener("webglcontextrestored", changed);
   new ResizeObserver(resize).observe(document.querySelector(".stage"));
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
-    state.theme = readTheme();
-    resize();
-  });
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => resize((state.theme = readTheme())));
   describe(episode);
   state.time = clamp(Number(hash.get("step")) || 0, 0, episode.steps);
   const still = matchMedia("(prefers-reduced-motion: reduce)").matches || hash.has("step");
   resize();
   setPlaying(!still);
-}
-
-function chooseRenderer(canvas, episode, bounds, flat) {
-  if (!flat) {
-    try {
-      return new GlRenderer(canvas, episode, bounds);
-    } catch (error) {
-      console.warn(error.message);
-    }
-  }
-  const notice = document.getElementById("notice");
-  notice.hidden = false;
-  notice.textContent = "Simple drawing: this browser offers no WebGL 2 here.";
-  return new FlatRenderer(canvas, episode);
 }
 
 function chooseSpeeds(select, episode, state) {
@@ -146,36 +105,25 @@ function chooseSpeeds(select, episode, state) {
   select.addEventListener("change", () => (state.speed = Number(select.value)));
 }
 
-function listenForKeys({ episode, state, camera, seek, setPlaying, changed }) {
-  const zoom = (factor) => {
-    camera.zoom(factor);
-    changed();
-  };
+function listenForKeys({ episode, state, view, seek, setPlaying }) {
   const actions = {
     ArrowRight: (size) => seek(Math.floor(state.time + 1e-6) + size),
     ArrowLeft: (size) => seek(Math.ceil(state.time - 1e-6) - size),
+    " ": () => setPlaying(!state.playing),
     Home: () => seek(0),
     End: () => seek(episode.steps),
-    r: () => {
-      camera.reset();
-      changed();
-    },
-    "+": () => zoom(0.87),
-    "=": () => zoom(0.87),
-    "-": () => zoom(1.15),
+    r: () => view.reset(),
+    "+": () => view.zoom(0.87),
+    "=": () => view.zoom(0.87),
+    "-": () => view.zoom(1.15),
   };
   document.addEventListener("keydown", (event) => {
-    if (event.ctrlKey || event.metaKey || event.altKey) return;
     const at = event.target;
-    if (at instanceof HTMLSelectElement) return;
-    if (event.key === " ") {
-      if (at instanceof HTMLButtonElement || at.type === "checkbox") return; // these have a use for it
-      setPlaying(!state.playing);
-    } else {
-      const action = actions[event.key] || actions[event.key.toLowerCase()];
-      if (!action) return;
-      action(event.shiftKey ? 10 : 1);
-    }
+    if (event.ctrlKey || event.metaKey || event.altKey || at instanceof HTMLSelectElement) return;
+    if (event.key === " " && (at instanceof HTMLButtonElement || at.type === "checkbox")) return; // these have a use for it
+    const action = actions[event.key] || actions[event.key.toLowerCase()];
+    if (!action) return;
+    action(event.shiftKey ? 10 : 1);
     event.preventDefault();
   });
 }
@@ -184,69 +132,62 @@ function listenForKeys({ episode, state, camera, seek, setPlaying, changed }) {
 
 const OUTCOMES = { success: "Target reached", diverged: "Simulation diverged", open: "Target not reached" };
 
-function outcomeOf(episode) {
-  return episode.diverged ? "diverged" : episode.success ? "success" : "open";
-}
-
 function describe(episode) {
-  const outcome = document.getElementById("outcome");
+  const outcome = by("outcome");
+  const ending = episode.diverged ? "diverged" : episode.success ? "success" : "open";
   const seconds = (episode.steps * episode.controlDt).toFixed(2);
-  outcome.classList.add(outcomeOf(episode));
-  outcome.textContent = `${OUTCOMES[outcomeOf(episode)]} after ${episode.steps} steps, ${seconds} s`;
-  document.getElementById("scene").setAttribute(
-    "aria-label",
-    `Soft arm of ${episode.agents} sections, task ${episode.task}, ${episode.cylinders.length} obstacles. ${outcome.textContent}.`,
-  );
+  outcome.classList.add(ending);
+  outcome.textContent = `${OUTCOMES[ending]} after ${episode.steps} steps, ${seconds} s`;
+  const scene = `Soft arm of ${episode.agents} sections, task ${episode.task}, ${episode.cylinders.length} obstacles.`;
+  by("scene").setAttribute("aria-label", `${scene} ${outcome.textContent}.`);
 }
 
 const millimetres = (metres) => `${(1000 * metres).toFixed(0)} mm`;
-const minus = (text) => text.replace("-", "−");
 
 function readOuts(episode, state) {
-  const by = (id) => document.getElementById(id);
   const step = Math.floor(state.time);
-  const found = episode.slots.filter((slot) => slot.step <= step).length;
   by("time").value = step;
   by("time").setAttribute("aria-valuetext", `step ${step} of ${episode.steps}`);
-  const seconds = document.createElement("small");
-  seconds.textContent = `${(state.time * episode.controlDt).toFixed(2)} s`;
+  const seconds = Object.assign(document.createElement("small"), { textContent: `${(state.time * episode.controlDt).toFixed(2)} s` });
   by("clock").replaceChildren(`${step} / ${episode.steps}`, seconds);
-  by("n-distance").textContent = millimetres(episode.distance[step]);
-  by("n-reward").textContent = step ? minus(episode.reward[step - 1].toFixed(2)) : "–";
-  by("n-return").textContent = minus(episode.returned[step].toFixed(1));
-  by("n-contact").textContent = episode.touching[step];
-  by("n-bins").textContent = found;
-  by("c-distance").textContent = `success below ${millimetres(episode.successRadius)}`;
+  const texts = {
+    "n-distance": millimetres(episode.distance[step]),
+    "n-reward": step ? minus(episode.reward[step - 1].toFixed(2)) : "–",
+    "n-return": minus(episode.returned[step].toFixed(1)),
+    "n-contact": episode.touching[step],
+    "n-bins": episode.slots.filter((slot) => slot.step <= step).length,
+    "c-distance": `success below ${millimetres(episode.successRadius)}`,
+  };
+  for (const [id, text] of Object.entries(texts)) by(id).textContent = text;
 }
 
 function speak(episode, state) {
   const step = Math.floor(state.time);
-  document.getElementById("spoken").textContent =
+  by("spoken").textContent =
     `Step ${step} of ${episode.steps}: ${millimetres(episode.distance[step])} to the target, ${episode.touching[step]} nodes in contact.`;
 }
 
-function drawLabels(canvas, episode, rod, camera, state, ratio) {
-  const context = canvas.getContext("2d");
-  context.setTransform(1, 0, 0, 1, 0, 0);
-  context.clearRect(0, 0, canvas.width, canvas.height);
-  if (!state.show.labels) return;
-  context.setTransform(ratio, 0, 0, ratio, 0, 0);
-  context.font = "600 10.5px system-ui, sans-serif";
-  context.textAlign = "center";
-  context.textBaseline = "middle";
+// Without WebGL: thick strokes with round ends, one over the other.
+function drawFlat(context, episode, rod, view) {
+  const stroke = (start, end, radius, colour) => {
+    const [a, b] = [view.project(start), view.project(along(end, UP, 1e-4))]; // a stroke without length is none
+    if (Math.min(a.metres, b.metres) <= 0) return;
+    Object.assign(context, { lineCap: "round", lineWidth: (2 * radius) / a.metres, strokeStyle: colour });
+    context.stroke(new Path2D(`M${a.x} ${a.y}L${b.x} ${b.y}`));
+  };
+  for (const c of episode.cylinders) stroke(c.start, along(c.start, c.axis, c.length), c.radius, css(PAINT.column, 0.5));
+  rod.slice(1).forEach((node, i) => stroke(rod[i].centre, node.centre, node.radius, css(gradient(PAINT.arm, i / rod.length))));
+  stroke(episode.target, episode.target, episode.successRadius, css(PAINT.target, 0.6));
+}
+
+function drawLabels(context, episode, rod, view) {
+  Object.assign(context, { font: "600 10.5px system-ui, sans-serif", textAlign: "center", textBaseline: "middle" });
+  const [white, ink] = [new Color("#ffffff"), new Color("#1b2430")];
   episode.agentNodes.forEach((node, agent) => {
-    const frame = frameAt(rod, node, episode.elements);
-    const [x, y, depth] = camera.project(frame.centre);
-    if (depth < NEAR) return;
-    const colour = agentColour(agent, episode.agents);
-    context.beginPath();
-    context.arc(x, y, 8, 0, 2 * Math.PI);
-    context.fillStyle = "#ffffff";
-    context.fill();
-    context.lineWidth = 2;
-    context.strokeStyle = css(mixed(colour, [0, 0, 0], 0.15));
-    context.stroke();
-    context.fillStyle = "#1b2430";
+    const { x, y, metres } = view.project(rod[node].centre);
+    if (metres <= 0) return;
+    disc(context, x, y, 8, white, mixed(agentColour(agent, episode.agents), ink, 0.2), 2);
+    context.fillStyle = css(ink);
     context.fillText(String(agent + 1), x, y + 0.5);
   });
 }

@@ -3,16 +3,15 @@
 const STAGES = { stage1: "obstacles → agents", stage2: "agents ↔ agents" };
 
 function makeMatrix(episode, state, changed) {
-  const by = (id) => document.getElementById(id);
   const names = Object.keys(STAGES).filter((name) => episode.attention[name]);
   if (!names.length) {
     by("s-edges-name").textContent = "sensed bins";
-    return { resize: () => {}, draw: () => {} };
+    return [];
   }
   by("attention").hidden = false;
   const options = (id, entries) => by(id).replaceChildren(...entries.map(([text, value]) => new Option(text, value)));
   const first = episode.attention[names[0]];
-  const numbered = (count, name) => Array.from({ length: count }, (_, k) => [`${name} ${k + 1}`, k]);
+  const numbered = (n, name) => count(n).map((k) => [`${name} ${k + 1}`, k]);
   options("a-stage", [...(names.length > 1 ? [["both", ""]] : []), ...names.map((name) => [STAGES[name], name])]);
   options("a-layer", [["mean", ""], ...numbered(first.layers, "layer")]);
   options("a-head", [["mean", ""], ...numbered(first.heads, "head")]);
@@ -31,10 +30,9 @@ function makeMatrix(episode, state, changed) {
     paintTables(context, width, height, tables, episode, state.theme);
     const every = first.every > 1 ? `; kept for every ${first.every}th step` : "";
     by("c-attention").textContent = `decision of step ${step - (step % first.every) + 1}${every}`;
-    by("a-note").textContent = "One row per agent, the tip's on top; its weights add up to 1. In the scene violet lines lead from bins to agents and blue bows from neighbour to neighbour; the larger the weight, the more opaque.";
   });
   by("p-matrix").style.height = `${clamp(18 * episode.agents, 84, 240) + 16}px`;
-  return plot;
+  return [plot];
 }
 
 // Columns that carry any weight at this step.
@@ -49,39 +47,37 @@ function table(episode, name, step, choice) {
 
 function paintTables(context, width, height, tables, episode, theme) {
   const { agents } = episode;
-  const gap = 14;
-  const left = 16;
-  const top = 15;
+  const [gap, left, top] = [14, 16, 15];
   const room = width - left - gap * (tables.length - 1);
   const rows = (height - top) / agents;
-  // no cell wider than 1.6 rows; the agents' square first, bins share the rest
-  const wanted = tables.map((t) => t.columns * rows * 1.6);
-  const square = tables.find((t) => t.name === "stage2");
-  const fixed = square && tables.length > 1 ? Math.min(0.42 * room, agents * rows * 1.6) : 0;
-  let x = left;
-  context.font = "10.5px system-ui, sans-serif";
-  context.textBaseline = "middle";
+  const fill = (colour, ...box) => {
+    context.fillStyle = colour;
+    context.fillRect(...box);
+  };
+  const write = (text, x, y) => {
+    Object.assign(context, { font: "10.5px system-ui, sans-serif", textBaseline: "middle", fillStyle: css(theme.soft) });
+    context.fillText(text, x, y);
+  };
   for (let agent = 0; agent < agents; agent++) {
-    context.fillStyle = css(agentColour(agent, agents));
     const y = top + rows * (agents - 1 - agent);
-    context.fillRect(left - 6, y + 1, 4, rows - 2);
-    context.fillStyle = css(theme.soft);
-    if (rows > 9) context.fillText(String(agent + 1), 0, y + rows / 2);
+    fill(css(agentColour(agent, agents)), left - 6, y + 1, 4, rows - 2);
+    if (rows > 9) write(String(agent + 1), 0, y + rows / 2);
   }
-  tables.forEach((t, k) => {
-    const available = tables.length === 1 ? room : t.name === "stage2" ? fixed : room - fixed;
-    const cell = Math.min(available, wanted[k]) / t.columns;
-    context.fillStyle = css(theme.soft);
-    const text = t.name === "stage2" ? "agents" : t.columns > 1 ? `self, ${t.columns - 1} bins` : "self";
-    context.fillText(text, x, 6);
-    const colour = t.name === "stage2" ? theme.neighbours : PAINT.attention;
-    context.fillStyle = css(theme.line, 0.45);
-    context.fillRect(x, top, cell * t.columns, height - top);
-    for (const [receiver, source, weight] of t.cells) {
-      context.fillStyle = css(mixed(theme.panel, colour, Math.sqrt(weight)));
-      const inset = cell > 5 ? 0.5 : 0;
-      context.fillRect(x + cell * source + inset, top + rows * (agents - 1 - receiver) + 0.5, cell - 2 * inset, rows - 1);
+  // no cell wider than 1.6 rows; the agents' square first, bins share the rest
+  const square = tables.length > 1 ? Math.min(0.42 * room, agents * rows * 1.6) : room;
+  let x = left;
+  for (const { name, columns, cells } of tables) {
+    const neighbours = name === "stage2";
+    const available = neighbours || tables.length === 1 ? square : room - square;
+    const cell = Math.min(available / columns, rows * 1.6);
+    write(neighbours ? "agents" : columns > 1 ? `self, ${columns - 1} bins` : "self", x, 6);
+    fill(css(theme.line, 0.45), x, top, cell * columns, height - top);
+    const inset = cell > 5 ? 0.5 : 0;
+    for (const [receiver, source, weight] of cells) {
+      const box = [x + cell * source + inset, top + rows * (agents - 1 - receiver) + 0.5, cell - 2 * inset, rows - 1];
+      fill(css(theme.panel), ...box);
+      fill(css(neighbours ? theme.neighbours : PAINT.attention, Math.sqrt(weight)), ...box);
     }
-    x += cell * t.columns + gap;
-  });
+    x += cell * columns + gap;
+  }
 }

@@ -3,7 +3,7 @@
 class Plot {
   // paint(context, width, height) draws what stands still; cursor(context, width, height) the rest.
   constructor(canvas, steps, paint, cursor, seek) {
-    Object.assign(this, { canvas, steps, paint, cursor, still: null });
+    Object.assign(this, { canvas, paint, cursor, still: null });
     if (!seek) return;
     const go = (event) => {
       const box = canvas.getBoundingClientRect();
@@ -16,9 +16,7 @@ class Plot {
     canvas.addEventListener("pointermove", (event) => event.buttons && go(event));
   }
 
-  resize() {
-    this.still = null;
-  }
+  resize() { this.still = null; }
 
   draw() {
     const { canvas } = this;
@@ -26,10 +24,9 @@ class Plot {
     const [width, height] = [canvas.clientWidth, canvas.clientHeight];
     if (!width || !height) return;
     if (!this.still) {
-      canvas.width = Math.round(width * ratio);
-      canvas.height = Math.round(height * ratio);
-      this.still = document.createElement("canvas");
-      [this.still.width, this.still.height] = [canvas.width, canvas.height];
+      const size = { width: Math.round(width * ratio), height: Math.round(height * ratio) };
+      Object.assign(canvas, size);
+      this.still = Object.assign(document.createElement("canvas"), size);
       const context = this.still.getContext("2d");
       context.scale(ratio, ratio);
       this.paint(context, width, height);
@@ -43,16 +40,20 @@ class Plot {
   }
 }
 
-function tidySteps(low, high, count) {
-  const raw = (high - low) / count || 1;
+function tidySteps(low, high, wanted) {
+  const raw = (high - low) / wanted || 1;
   const power = 10 ** Math.floor(Math.log10(raw));
   const step = power * [1, 2, 2.5, 5, 10].find((k) => k * power >= raw);
-  const ticks = [];
-  for (let k = Math.ceil(low / step - 1e-9); k * step <= high + 1e-9 * step; k++) ticks.push(k * step);
-  return ticks;
+  const first = Math.ceil(low / step - 1e-9);
+  return count(Math.floor(high / step + 1e-9) - first + 1).map((k) => (first + k) * step);
 }
 
-const short = (x) => String(+x.toPrecision(3)).replace("-", "−");
+const minus = (text) => text.replace("-", "−");
+
+const scales = (width, height, steps, low, high) => [
+  (step) => (step / steps) * (width - 2) + 1,
+  (value) => 16 + (height - 20) * (1 - (value - low) / (high - low || 1)),
+];
 
 // Lines [{ values, colour, width }] on a grid with numbers at the left.
 function paintLines(context, width, height, lines, low, high, theme, extra) {
@@ -63,100 +64,68 @@ function paintLines(context, width, height, lines, low, high, theme, extra) {
     context.fillStyle = css(theme.line);
     context.fillRect(0, Math.round(y(tick)), width, 1);
     context.fillStyle = css(theme.soft);
-    context.fillText(short(tick), 1, y(tick) - 1);
+    context.fillText(minus(String(+tick.toPrecision(3))), 1, y(tick) - 1);
   }
-  if (extra) extra(context, x, y);
+  if (extra) extra(y);
   context.lineJoin = "round";
   context.beginPath();
   context.rect(0, 0, width, height);
   context.clip();
-  for (const { values: row, colour, width: thick } of lines) {
+  for (const { values, colour, width: thick } of lines) {
     context.strokeStyle = css(colour);
     context.lineWidth = thick;
     context.beginPath();
-    for (let step = 0; step < row.length; step++) context.lineTo(x(step), y(row[step]));
+    values.forEach((value, step) => context.lineTo(x(step), y(value)));
     context.stroke();
   }
 }
 
-function scales(width, height, steps, low, high) {
-  const inner = height - 20;
-  return [(step) => (step / Math.max(steps, 1)) * (width - 2) + 1, (value) => 16 + inner * (1 - (value - low) / (high - low || 1))];
-}
-
-function range(rows) {
-  let [low, high] = [Infinity, -Infinity];
-  for (const row of rows) {
-    for (const value of row) {
-      low = Math.min(low, value);
-      high = Math.max(high, value);
-    }
-  }
-  return [Math.min(low, 0), Math.max(high, 0, low + 1e-9)];
-}
-
-function paintCursor(context, width, height, time, steps, theme) {
-  context.fillStyle = css(theme.text, 0.55);
-  context.fillRect((time / steps) * (width - 2) + 0.25, 0, 1.5, height);
-}
-
-function paintDot(context, x, y, colour, theme) {
-  context.beginPath();
-  context.arc(x, y, 3.6, 0, 2 * Math.PI);
-  context.fillStyle = css(colour);
-  context.fill();
-  context.lineWidth = 1.5;
-  context.strokeStyle = css(theme.panel);
-  context.stroke();
-}
-
-// Reads a row of values between two steps.
-function valueAt(row, time) {
-  const step = Math.min(Math.floor(time), row.length - 1);
-  return mix(row[step], row[Math.min(step + 1, row.length - 1)], time - step);
-}
-
 function makePlots(episode, state, seek) {
-  const { steps, agents } = episode;
-  const by = (id) => document.getElementById(id);
-  const shown = episode.terms.map((_, k) => k).filter((k) => episode.earned[k].some((x) => x !== 0));
+  const { agents, distance, earned, steps, touching } = episode;
+  const shown = count(earned.length).filter((k) => earned[k].some((x) => x !== 0));
   // the bonus of the last step would flatten all others
-  const [low, high] = range(shown.filter((k) => episode.terms[k] !== "success").map((k) => episode.earned[k]));
-  const far = Math.max(...episode.distance) * 1.04;
+  const ordinary = shown.filter((k) => episode.terms[k] !== "success").flatMap((k) => earned[k]);
+  const [low, high] = [Math.min, Math.max].map((pick) => ordinary.reduce((most, value) => pick(most, value), 0));
+  const far = Math.max(...distance) * 1.04;
+  const colour = (k) => SERIES[k % SERIES.length];
+  const cursor = (context, width, height) => {
+    context.fillStyle = css(state.theme.text, 0.55);
+    context.fillRect((state.time / steps) * (width - 2) + 0.25, 0, 1.5, height);
+  };
 
-  const distance = new Plot(by("p-distance"), steps, (context, width, height) => {
+  const way = new Plot(by("p-distance"), steps, (context, width, height) => {
     const { theme } = state;
-    paintLines(context, width, height, [{ values: episode.distance, colour: theme.accent, width: 1.8 }], 0, far, theme, (c, x, y) => {
-      c.fillStyle = css(PAINT.reached, 0.2);
-      c.fillRect(0, y(episode.successRadius), width, y(0) - y(episode.successRadius));
+    paintLines(context, width, height, [{ values: distance, colour: theme.accent, width: 1.8 }], 0, far, theme, (y) => {
+      context.fillStyle = css(PAINT.reached, 0.2);
+      context.fillRect(0, y(episode.successRadius), width, y(0) - y(episode.successRadius));
     });
   }, (context, width, height) => {
-    paintCursor(context, width, height, state.time, steps, state.theme);
+    cursor(context, width, height);
     const [x, y] = scales(width, height, steps, 0, far);
-    paintDot(context, x(state.time), y(valueAt(episode.distance, state.time)), state.theme.accent, state.theme);
+    const step = Math.min(Math.floor(state.time), steps - 1);
+    const now = mix(distance[step], distance[step + 1], state.time - step);
+    disc(context, x(state.time), y(now), 3.6, state.theme.accent, state.theme.panel, 1.5);
   }, seek);
 
   const terms = new Plot(by("p-terms"), steps, (context, width, height) => {
-    const lines = shown.map((k) => ({ values: episode.earned[k], colour: SERIES[k % SERIES.length], width: 1.5 }));
+    const lines = shown.map((k) => ({ values: earned[k], colour: colour(k), width: 1.5 }));
     if (lines.length) paintLines(context, width, height, lines, low, high, state.theme);
-  }, (context, width, height) => paintCursor(context, width, height, state.time, steps, state.theme), seek);
+  }, cursor, seek);
 
+  const gap = 12; // between the pictures of both components
   const actions = new Plot(by("p-actions"), steps, (context, width, height) => {
-    const picture = new ImageData(steps, agents);
-    const gap = 12;
-    for (let side = 0; side < 2; side++) {
-      for (let step = 0; step < steps; step++) {
-        for (let agent = 0; agent < agents; agent++) {
-          const rgb = signed(episode.action[2 * (step * agents + agent) + side], state.theme);
-          const at = 4 * ((agents - 1 - agent) * steps + step); // the tip's agent on top, as in the scene
-          picture.data.set([...rgb.map((v) => Math.round(255 * v)), 255], at);
+    const half = (width - gap) / 2;
+    context.imageSmoothingEnabled = steps > width / 2;
+    for (const side of [0, 1]) {
+      const small = Object.assign(document.createElement("canvas"), { width: steps, height: agents });
+      const ink = small.getContext("2d");
+      for (const [agent, step] of count(agents).flatMap((agent) => count(steps).map((step) => [agent, step]))) {
+        const value = episode.action[2 * (step * agents + agent) + side];
+        for (const fill of [css(state.theme.line), css(value < 0 ? NEGATIVE : POSITIVE, Math.min(1, Math.abs(value)))]) {
+          ink.fillStyle = fill;
+          ink.fillRect(step, agents - 1 - agent, 1, 1); // the tip's agent on top, as in the scene
         }
       }
-      const small = document.createElement("canvas");
-      [small.width, small.height] = [steps, agents];
-      small.getContext("2d").putImageData(picture, 0, 0);
-      context.imageSmoothingEnabled = steps > width / 2;
-      const half = (width - gap) / 2;
       context.drawImage(small, side * (half + gap), 0, half, height);
     }
     for (let agent = 0; agent < agents; agent++) {
@@ -164,40 +133,40 @@ function makePlots(episode, state, seek) {
       context.fillRect(width / 2 - 2, (height * (agents - 1 - agent)) / agents + 1, 4, height / agents - 2);
     }
   }, (context, width, height) => {
-    const half = (width - 12) / 2;
+    const half = (width - gap) / 2;
     context.fillStyle = css(state.theme.text);
-    for (const left of [0, half + 12]) context.fillRect(left + (state.time / steps) * (half - 1.5), 0, 1.5, height);
+    for (const left of [0, half + gap]) context.fillRect(left + (state.time / steps) * (half - 1.5), 0, 1.5, height);
   });
 
   // discoveries and contacts above the slider, whose thumb stays 8 px from its ends
   const events = new Plot(by("events"), steps, (context, width) => {
     const x = (step) => 8 + (step / steps) * (width - 16);
-    const most = Math.max(...episode.touching);
-    for (let step = 0; step <= steps; step++) {
-      if (!episode.touching[step]) continue;
-      const size = 3 + (6 * episode.touching[step]) / most;
-      context.fillStyle = css(state.theme.touching, 0.8);
-      context.fillRect(x(step) - 0.5, 12 - size, Math.max(1, (width - 16) / steps), size);
-    }
+    const most = Math.max(...touching);
+    context.fillStyle = css(state.theme.touching, 0.8);
+    touching.forEach((nodes, step) => {
+      const size = 3 + (6 * nodes) / most;
+      if (nodes) context.fillRect(x(step) - 0.5, 12 - size, Math.max(1, (width - 16) / steps), size);
+    });
     context.fillStyle = css(PAINT.discovered);
     for (const step of new Set(episode.slots.map((slot) => slot.step))) context.fillRect(x(step) - 0.75, 0, 2, 4);
   }, () => {});
 
   const legend = shown.map((k) => {
-    const item = document.createElement("li");
-    const swatch = document.createElement("i");
-    const value = document.createElement("b");
-    swatch.style.background = css(SERIES[k % SERIES.length]);
+    const [item, swatch, value] = ["li", "i", "b"].map((tag) => document.createElement(tag));
+    swatch.style.background = css(colour(k));
     item.append(swatch, episode.terms[k], value);
     by("legend").append(item);
-    return { value, row: episode.earned[k] };
+    return () => (value.textContent = minus(earned[k][Math.floor(state.time)].toFixed(2)));
   });
-  const plots = [distance, terms, actions, events];
-  return {
-    resize: () => plots.forEach((plot) => plot.resize()),
-    draw: () => {
-      plots.forEach((plot) => plot.draw());
-      for (const { value, row } of legend) value.textContent = row[Math.floor(state.time)].toFixed(2).replace("-", "−");
-    },
-  };
+  return [way, terms, actions, events, { draw: () => legend.forEach((write) => write()), resize: () => {} }];
+}
+
+function disc(context, x, y, radius, colour, rim, thick) {
+  context.beginPath();
+  context.arc(x, y, radius, 0, 2 * Math.PI);
+  context.fillStyle = css(colour);
+  context.fill();
+  context.lineWidth = thick;
+  context.strokeStyle = css(rim);
+  context.stroke();
 }

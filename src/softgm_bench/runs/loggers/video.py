@@ -22,13 +22,13 @@ def episode_video(config: Config, policy: TensorDictModuleBase, sizes: Sizes, fr
     if not kind_of(config.task).has_arm or not all(map(importlib.util.find_spec, ("av", "PIL"))):
         return None
     from softgm_bench.render import video  # late: drawing is an extra
-    from softgm_bench.render.still import Look, Studio
+    from softgm_bench.render.still import PictureSettings, Studio
 
     settings = config.experiment.evaluation
     horizon = min(settings.final_horizon or config.task.horizon, LONGEST)
     trained = TrainedPolicy(policy, sizes, config, frames, versions(), config)
     episode = record(trained, config.seed, horizon=horizon, deterministic=settings.deterministic)
-    studio = Studio(episode, Look(width=WIDTH, height=HEIGHT, text=True))
+    studio = Studio(episode, PictureSettings(width=WIDTH, height=HEIGHT, text=True))
     control_dt = studio.stage.control_dt
     speed = video.natural_speed(episode.steps * control_dt)
     times = video.moments(episode.steps, control_dt, FPS, speed)
