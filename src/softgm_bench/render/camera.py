@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from softgm_bench.experiment.trajectory import Trajectory
+from softgm_bench.episodes.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 FIELD_OF_VIEW = 28.0  # degrees, vertical: a long lens, so that near columns do not dwarf the arm
