@@ -1,4 +1,4 @@
-"""How the arm's tasks are played: ``SoftArmEnv`` from a run's settings."""
+"""The arm's tasks are played by ``SoftArmEnv``, built here from a run's settings."""
 
 from dataclasses import replace
 

@@ -15,7 +15,7 @@ from softgm_bench.envs.tasks.base import CurriculumConfig
 
 
 class Progress(TensorClass):
-    """Where a curriculum stands; ``batch_size`` is ``(num_envs,)``.
+    """The standing of a curriculum; ``batch_size`` is ``(num_envs,)``.
 
     Attributes:
         stage: from 0 to ``stages``, ``(num_envs,)`` int64; the same everywhere.
@@ -31,7 +31,7 @@ class Progress(TensorClass):
 
 
 def first_progress(num_envs: int, device: torch.device) -> Progress:
-    """The easiest stage, before any episode has begun."""
+    """Stand at the easiest stage, before any episode has begun."""
     zero = torch.zeros(num_envs, dtype=torch.int64, device=device)
     return Progress(
         stage=zero,
@@ -43,7 +43,7 @@ def first_progress(num_envs: int, device: torch.device) -> Progress:
 
 
 def difficulty(progress: Progress, config: CurriculumConfig) -> Tensor:
-    """Of the scenes to be drawn now: from 0 to exactly 1, float64 without dimensions."""
+    """Give the difficulty of the scenes to be drawn now: from 0 to exactly 1, float64 without dimensions."""
     return progress.stage[0].to(torch.float64) / config.stages
 
 

@@ -1,4 +1,4 @@
-"""What the rest of the package knows of an environment, whichever it is.
+"""The interface of environments: all that the rest of the package knows of one, whichever it is.
 
 A task's configuration says which environment plays it (``kind_of``). Networks and memories are built from ``Sizes``,
 so that an actor can be built without an environment.
@@ -35,7 +35,7 @@ class Sizes:
 
     @property
     def layout(self) -> str:
-        """How agents observe: ``GRAPH`` (the entries ``entries.OBSERVATION``) or ``VECTOR`` (one vector an agent)."""
+        """The layout of observations: ``GRAPH`` (the entries ``entries.OBSERVATION``) or ``VECTOR`` (a vector an agent)."""
         return VECTOR if self.n_features else GRAPH
 
 
@@ -59,7 +59,7 @@ class Environment(Protocol):
         """Give the state of the generators that episodes are drawn from."""
 
     def set_generator_state(self, state: Tensor) -> None:
-        """Go on drawing from what ``generator_state`` returned."""
+        """Continue drawing from what ``generator_state`` returned."""
 
     def simulation_state(self) -> TensorDict:
         """Give a copy of all episodes as they stand, ``(num_envs,)``."""
@@ -95,7 +95,7 @@ class Settings(Protocol):
 
 @dataclass(frozen=True)
 class Kind:
-    """How the tasks of one kind are played.
+    """The way in which the tasks of one kind are played.
 
     Attributes:
         base: class of their configurations.

@@ -1,4 +1,4 @@
-"""What goes wrong in a robot: noisy observations, sections that do nothing, a push on the tip.
+"""The faults of a real robot: noisy observations, sections that do nothing, a push on the tip.
 
 The paper's three cases (section "Robustness") are the files of ``conf/perturbation``. Physics, reward, metrics and
 sensing are always those of the true state.
@@ -33,17 +33,17 @@ class PerturbationConfig:
 
     @property
     def noisy(self) -> bool:
-        """Whether any observation is."""
+        """True if any observation is noisy."""
         return max(self.position_sigma, self.velocity_sigma, self.action_sigma) > 0.0
 
     @property
     def nothing(self) -> bool:
-        """Whether everything stays as it is."""
+        """True if everything stays as it is."""
         return not (self.noisy or self.failed_agents or self.pushes)
 
     @property
     def pushes(self) -> bool:
-        """Whether a force ever acts on the tip."""
+        """True if a force ever acts on the tip."""
         return self.tip_force > 0.0
 
     def __post_init__(self) -> None:
@@ -70,7 +70,7 @@ class PerturbationConfig:
 
 
 class Perturbation:
-    """What happens to ``num_envs`` environments.
+    """Perturbs ``num_envs`` environments.
 
     Attributes:
         config: what can happen.
@@ -122,7 +122,7 @@ class Perturbation:
         return drawn if mask is None else torch.where(mask.unsqueeze(-1), drawn, push)
 
     def applied(self, action: Tensor) -> Tensor:
-        """Of the actions that policies chose, ``(num_envs, n_agents, 2)``, what the sections do."""
+        """Give the sections' actions from those that policies chose, ``(num_envs, n_agents, 2)``: failed ones do nothing."""
         return torch.where(self._works, action, self._silence) if self.config.failed_agents else action
 
     def tip_force(self, push: Tensor, steps: Tensor, active: Tensor) -> Tensor:
@@ -138,7 +138,7 @@ class Perturbation:
         return config.tip_force * push * now.unsqueeze(-1)
 
     def observed(self, position: Tensor, velocity: Tensor, previous_action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """What agents observe of themselves: ``(count, n_agents, 3)``, the same, ``(count, n_agents, 2)``; float32."""
+        """Add noise to agents' own entries: ``(count, n_agents, 3)``, the same, ``(count, n_agents, 2)``; float32."""
         if not self.config.noisy:
             return position, velocity, previous_action
         channels = 2 * position.shape[-1] + previous_action.shape[-1]

@@ -45,7 +45,7 @@ class SlotTable(TensorClass):
 
 
 class Sight(NamedTuple):
-    """What the agents of ``num_envs`` environments see, after a look around.
+    """All that the agents of ``num_envs`` environments sense and have discovered, after one sensing.
 
     Attributes:
         table: with what has just been discovered.
@@ -63,7 +63,7 @@ class Sight(NamedTuple):
 
 
 def bins_per_cylinder(max_length: float, bin_length: float) -> int:
-    """Bins that the longest cylinder is cut into; the last one may be shorter."""
+    """Count the bins that the longest cylinder is cut into; the last one may be shorter."""
     return math.ceil(max_length / bin_length - 1e-9)
 
 
@@ -95,7 +95,7 @@ def cut_into_bins(cylinders: Cylinders, bin_length: float, max_length: float) ->
 
 
 def empty_table(num_envs: int, n_slots: int, n_bins: int, device: torch.device) -> SlotTable:
-    """A table in which nothing has been discovered."""
+    """Make a table in which nothing has been discovered."""
     count = torch.zeros(num_envs, dtype=torch.int64, device=device)
     return SlotTable(
         bin_of_slot=torch.full((num_envs, n_slots), -1, dtype=torch.int64, device=device),
@@ -156,7 +156,7 @@ def look_dense(agent_position: Tensor, bins: Bins, table: SlotTable, sensing_rad
 
 
 def sense(agent_position: Tensor, bins: Bins, sensing_radius: float) -> Tensor:
-    """Which agent senses which bin: ``||p_i - c_k|| - r_k < rho``.
+    """Sense bins by the paper's test, ``||p_i - c_k|| - r_k < rho``.
 
     Args:
         agent_position: m, ``(num_envs, n_agents, 3)``.
@@ -202,7 +202,7 @@ def discover(table: SlotTable, sensed: Tensor) -> tuple[SlotTable, Tensor]:
 
 
 def observe_slots(table: SlotTable, bins: Bins, sensed: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """What the graph shows of the obstacles.
+    """Show the graph's obstacle slots.
 
     Returns:
         Descriptors ``(num_envs, n_slots, 9)``, zero for PAD; active slots ``(num_envs, n_slots)``; edges from slot to

@@ -232,7 +232,7 @@ class Simulator:
     # a control step
 
     def step(self, action: Tensor) -> Outcome:
-        """Move every environment whose episode goes on.
+        """Move every environment whose episode is under way.
 
         Args:
             action: what the policies chose, in [-1, 1], ``(num_envs, n_agents, 2)``.

@@ -13,7 +13,7 @@ CHANNELS = 15  # of an agent or a slot, without the paper's reserved zeros
 
 
 def agent_channels(td: TensorDictBase, velocity_scale: float = 1.0) -> Tensor:
-    """The agents' features without the reserved zeros, ``(..., N, 15)``.
+    """Give the agents' features without the reserved zeros, ``(..., N, 15)``.
 
     In order: position, velocity, previous action (tangential zero, normal, binormal), target - position,
     tip - position. The velocity is multiplied by ``velocity_scale``; 1 is the paper.
@@ -27,7 +27,7 @@ def agent_channels(td: TensorDictBase, velocity_scale: float = 1.0) -> Tensor:
 
 
 def slot_channels(td: TensorDictBase) -> Tensor:
-    """The slots' features without the reserved zeros, ``(..., M, 15)``; an inactive slot (PAD) is exactly zero.
+    """Give the slots' features without the reserved zeros, ``(..., M, 15)``; an inactive slot (PAD) is exactly zero.
 
     In order: centre, axis, (radius, length, normalised axial position), target - centre, tip - centre.
     """
@@ -37,13 +37,13 @@ def slot_channels(td: TensorDictBase) -> Tensor:
 
 
 def obstacle_channels(descriptor: Tensor, target: Tensor, tip: Tensor) -> Tensor:
-    """Features of obstacle nodes from descriptors ``(..., 9)`` and targets and tips that broadcast to ``(..., 3)``."""
+    """Give the features of obstacle nodes from descriptors ``(..., 9)`` and targets and tips that broadcast to ``(..., 3)``."""
     centre = descriptor[..., :3]
     return torch.cat([descriptor, target - centre, tip - centre], dim=-1)
 
 
 def flat_observation(td: TensorDictBase) -> Tensor:
-    """What an MLP reads, per agent, ``(..., N, F)`` with F = ``flat_features(M)``: the same content as the graph.
+    """Give the flat view of an MLP, per agent, ``(..., N, F)`` with F = ``flat_features(M)``: the graph's content.
 
     In order: the agent's own 15 channels, the 15 channels of slot 0, 1, .., M - 1, the agent's own row of M sensed
     edges as 0 or 1. The 7 reserved zeros of each node carry nothing and are left out.
@@ -54,5 +54,5 @@ def flat_observation(td: TensorDictBase) -> Tensor:
 
 
 def flat_features(n_slots: int) -> int:
-    """Length of one agent's flat observation."""
+    """Give the length of one agent's flat observation."""
     return CHANNELS + n_slots * (CHANNELS + 1)

@@ -83,7 +83,7 @@ def build_action_value(
     centralised: bool,
     n_privileged: int = 0,
 ) -> AgentActionValue | TeamActionValue:
-    """A critic of actions with an encoder of its own, for an environment's sizes.
+    """Build a critic of actions with an encoder of its own, for an environment's sizes.
 
     With ``n_privileged`` above 0 it reads ``entries.PRIVILEGED`` too.
     """

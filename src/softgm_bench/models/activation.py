@@ -34,5 +34,5 @@ class Tanh(nn.Module):
     """``tanh`` as a layer."""
 
     def forward(self, x: Tensor) -> Tensor:
-        """Of any shape."""
+        """Apply tanh to every entry of a tensor of any shape."""
         return tanh(x)

@@ -41,7 +41,7 @@ def aggregate(values, weights, n_agents, out):
 
 @numba.njit(cache=True, parallel=True, error_model="numpy", fastmath=FAST)
 def differentiate(values, weights, gradient, n_agents, of_values, of_weights):
-    """From the gradient of ``aggregate``'s ``out`` write those of its messages and weights.
+    """Write the gradients of ``aggregate``'s messages and weights from that of its ``out``.
 
     Both results must hold zeros; ``of_values`` has the shape of ``values``, of which only messages are written.
     """

@@ -24,7 +24,7 @@ NEGATIVE_SLOPE = 0.2  # of LeakyReLU, as in Velickovic et al. 2018; the paper gi
 
 
 class Projection(NamedTuple):
-    """What attention needs of every node: C = out_features / heads channels a head.
+    """The projections of nodes that attention needs; C = out_features / heads channels a head.
 
     Attributes:
         message: u, ``(..., H, C)``.
@@ -164,7 +164,7 @@ class GraphAttention(nn.Module):
         return self.output(aggregated).flatten(0, 1), weights
 
     def _compiles(self, values: Tensor) -> bool:
-        """Whether ``ChainAttention`` can do it: the paper's scores, on a CPU, under no transformation such as vmap."""
+        """Tell whether ``ChainAttention`` can do it: the paper's scores, on a CPU, under no transformation such as vmap."""
         plain = not functorch.is_wrapped(values)
         return plain and not self.gatv2 and values.device.type == "cpu"
 

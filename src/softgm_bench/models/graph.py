@@ -1,4 +1,4 @@
-"""From the observation to the paper's graph: pure functions.
+"""The paper's graph from the observation, by pure functions.
 
 Shapes: ``...`` are any leading batch dimensions (time, environment), N agents, M obstacle slots. The node order is the
 paper's: the N agents first, then the M slots. Contract with the environment: an edge exists only from an active slot.

@@ -1,4 +1,4 @@
-"""From embeddings to TorchRL actors and critics; the same heads for every encoder.
+"""TorchRL actors and critics from embeddings, with the same heads for every encoder.
 
 Each network reads the observation from the tensordict itself: an encoder and its head cost one module call. A head
 that is built with ``n_privileged`` above 0 reads that many channels of ``entries.PRIVILEGED`` too: an asymmetric
@@ -103,12 +103,12 @@ class ValueConfig:
 
 
 def input_keys(encoder: Encoder | TeamEncoder, n_privileged: int) -> list[NestedKey]:
-    """Entries that a network on this encoder with ``n_privileged`` privileged channels reads."""
+    """List the entries that a network on this encoder with ``n_privileged`` privileged channels reads."""
     return [*encoder.in_keys, entries.PRIVILEGED] if n_privileged else list(encoder.in_keys)
 
 
 def privileged(td: TensorDictBase, n_privileged: int, like: Tensor) -> Tensor:
-    """The channels ``(..., n_privileged)`` of ``entries.PRIVILEGED``, which need not exist where that is 0.
+    """Give the channels ``(..., n_privileged)`` of ``entries.PRIVILEGED``, which need not exist where that is 0.
 
     ``like``: ``(..., n, m)``, whose leading dimensions and device nothing then has.
     """
@@ -256,7 +256,7 @@ def build_value(
     centralised: bool = True,
     n_privileged: int = 0,
 ) -> TeamValue | AgentValue:
-    """A critic with an encoder of its own: reads ``entries.OBSERVATION``, writes ``STATE_VALUE``.
+    """Build a critic with an encoder of its own, which reads ``entries.OBSERVATION``, writes ``STATE_VALUE``.
 
     A centralised critic says one value for the team, (B, 1); an independent one a value per agent, (B, N, 1), of what
     that agent's actor reads. With ``n_privileged`` above 0 its head reads ``entries.PRIVILEGED`` too.

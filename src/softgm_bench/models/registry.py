@@ -1,4 +1,4 @@
-"""Which encoder a configuration means: one table, filled by ``register_model``."""
+"""The table of models by configuration, filled by ``register_model``."""
 
 from collections.abc import Callable
 from typing import Any, ClassVar, TypeVar, get_type_hints
@@ -13,7 +13,7 @@ from softgm_bench.models import graph
 
 
 class Encoder(nn.Module):
-    """What the heads and the algorithms know of an encoder: one embedding per agent.
+    """The interface of an encoder for heads and algorithms: one embedding per agent.
 
     What is said here of the observation is the arm's; an encoder of another one says otherwise.
 
@@ -43,7 +43,7 @@ class Encoder(nn.Module):
 
 
 class TeamEncoder(nn.Module):
-    """What centralised critics know of an encoder: one embedding of all agents' observations and of further inputs.
+    """The interface of an encoder for centralised critics: one embedding of the whole team and of further inputs.
 
     Attributes:
         in_keys: the observation.

@@ -61,7 +61,7 @@ Record = list[Tensor] | None  # where to leave the attention of each layer
 
 @register_model("softgm", "softgm_no_stage1", "softgm_no_stage2", config=SoftGMConfig)
 class SoftGMEncoder(Encoder):
-    """From the observation to one embedding g_i per agent."""
+    """Turns the observation into one embedding g_i per agent."""
 
     def __init__(self, config: SoftGMConfig, sizes: Sizes) -> None:
         """Draw the parameters; none depends on N or M, which ``forward`` takes from the observation."""

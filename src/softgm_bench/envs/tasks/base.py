@@ -1,4 +1,4 @@
-"""What a task is: a configuration, and scenes drawn for any number of environments at once."""
+"""The contract of a task: a configuration, and scenes drawn for any number of environments at once."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -37,7 +37,7 @@ class RewardConfig:
 
 @dataclass
 class ActuationConfig:
-    """How actions become couples on the rod; see ``softgm_bench.rod.actuation``."""
+    """Settings by which actions become couples on the rod; see ``softgm_bench.rod.actuation``."""
 
     basis: str
     scaling: str
@@ -46,7 +46,7 @@ class ActuationConfig:
 
 @dataclass
 class CurriculumConfig:
-    """How training may begin with easier scenes; values and their meaning in ``conf/task/curriculum``.
+    """Settings by which training may begin with easier scenes; values and their meaning in ``conf/task/curriculum``.
 
     Tasks add the scenes' easiest ranges; ``softgm_bench.envs.curriculum`` moves between them and the task's own.
     """
@@ -75,7 +75,7 @@ class CurriculumConfig:
 
 @dataclass
 class TaskConfig:
-    """What every task has; values and their meaning in ``conf/task``."""
+    """Settings that every task has; values and their meaning in ``conf/task``."""
 
     name: str
     n_agents: int
@@ -114,7 +114,7 @@ class TaskConfig:
 
 
 class Scene(TensorClass):
-    """What is drawn at a reset; ``batch_size`` is ``(num_envs,)``.
+    """The scenes that a reset draws; ``batch_size`` is ``(num_envs,)``.
 
     Attributes:
         target: m, ``(num_envs, 3)``.
