@@ -35,7 +35,7 @@ class Sizes:
 
     @property
     def layout(self) -> str:
-        """The layout of observations: ``GRAPH`` (the entries ``entries.OBSERVATION``) or ``VECTOR`` (a vector an agent)."""
+        """The layout of observations: ``GRAPH`` (``entries.OBSERVATION``) or ``VECTOR`` (a vector an agent)."""
         return VECTOR if self.n_features else GRAPH
 
 

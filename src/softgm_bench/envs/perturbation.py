@@ -122,7 +122,7 @@ class Perturbation:
         return drawn if mask is None else torch.where(mask.unsqueeze(-1), drawn, push)
 
     def applied(self, action: Tensor) -> Tensor:
-        """Give the sections' actions from those that policies chose, ``(num_envs, n_agents, 2)``: failed ones do nothing."""
+        """Let failed sections do nothing; actions are ``(num_envs, n_agents, 2)``."""
         return torch.where(self._works, action, self._silence) if self.config.failed_agents else action
 
     def tip_force(self, push: Tensor, steps: Tensor, active: Tensor) -> Tensor:

@@ -37,7 +37,7 @@ def slot_channels(td: TensorDictBase) -> Tensor:
 
 
 def obstacle_channels(descriptor: Tensor, target: Tensor, tip: Tensor) -> Tensor:
-    """Give the features of obstacle nodes from descriptors ``(..., 9)`` and targets and tips that broadcast to ``(..., 3)``."""
+    """Give obstacle nodes' features from descriptors ``(..., 9)``, targets and tips that broadcast to ``(..., 3)``."""
     centre = descriptor[..., :3]
     return torch.cat([descriptor, target - centre, tip - centre], dim=-1)
 

@@ -164,7 +164,7 @@ class GraphAttention(nn.Module):
         return self.output(aggregated).flatten(0, 1), weights
 
     def _compiles(self, values: Tensor) -> bool:
-        """Tell whether ``ChainAttention`` can do it: the paper's scores, on a CPU, under no transformation such as vmap."""
+        """Tell whether ``ChainAttention`` can do it: the paper's scores, on a CPU, under no transform such as vmap."""
         plain = not functorch.is_wrapped(values)
         return plain and not self.gatv2 and values.device.type == "cpu"
 
