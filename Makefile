@@ -3,7 +3,7 @@ PYTHON ?= python3.11
 BIN := .venv/bin
 STAMP := .venv/.setup
 
-.PHONY: setup train test test-slow check bench bench-gpu parity validation peers peers-setup report pictures docs
+.PHONY: setup train test test-all check bench bench-gpu parity validation peers peers-setup report pictures docs
 
 setup: $(STAMP)
 
@@ -15,16 +15,22 @@ $(STAMP): pyproject.toml constraints.txt
 train: setup
 	$(BIN)/python -m softgm_bench algo=softgm task=basic seed=0 experiment=quick
 
-test: setup
-	$(BIN)/python -m pytest
+# One process a core, each with one thread: a test is too small to share among cores.
+PYTEST := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --dist loadscope
 
-test-slow: setup
-	$(BIN)/python -m pytest -m slow
+test: setup
+	$(PYTEST)
+
+# Everything: the CUDA simulator, the site, the notebook, the wheel, a browser, whole reports, kill tests, sweeps, the
+# whole product of algorithms, models and tasks, trainings that must learn.
+test-all: setup
+	$(PYTEST) -m "slow or not slow"
 
 check: setup
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
+	$(BIN)/lint-imports
 
 # Speed: rod and environment steps against PyElastica, distance to the roofline, scaling; SoftGM against
 # torch_geometric, the whole training loop. About fifteen minutes.

@@ -1,12 +1,14 @@
 """Shared fixtures: two cores at most, and task settings as the command line composes them."""
 
+import os
+
 import pytest
 import torch
 
 from softgm_bench.assembly import configure
 from softgm_bench.config import Config
 
-torch.set_num_threads(2)
+torch.set_num_threads(1 if "PYTEST_XDIST_WORKER" in os.environ else 2)
 
 TASKS = ("basic", "structured", "wall", "wall_narrow", "wall_fixed")
 

@@ -124,6 +124,7 @@ def test_importing_the_package_does_not_wait_for_torch():
     assert result.stdout == "False False\n"
 
 
+@pytest.mark.slow
 def test_the_example_runs(tmp_path):
     result = subprocess.run(
         [sys.executable, ROOT / "examples/api.py", tmp_path / "run"],
@@ -140,6 +141,7 @@ def test_the_example_runs(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
+@pytest.mark.slow
 def test_the_notebook_runs_from_its_folder():
     nbclient, nbformat = pytest.importorskip("nbclient"), pytest.importorskip("nbformat")
     pytest.importorskip("ipykernel")

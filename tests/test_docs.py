@@ -72,6 +72,7 @@ needs_mkdocs = pytest.mark.skipif(
 
 
 @needs_mkdocs
+@pytest.mark.slow
 def test_the_site_builds_without_warnings(tmp_path):
     built = site(ROOT, tmp_path)
     assert built.returncode == 0, built.stderr
@@ -84,6 +85,7 @@ def test_the_site_builds_without_warnings(tmp_path):
 
 
 @needs_mkdocs
+@pytest.mark.slow
 def test_the_site_is_refused_for_every_kind_of_mistake(tmp_path):
     """One checkout with all of them, so that it is built once."""
     pages, module = tmp_path / "docs", tmp_path / "src/softgm_bench/wrong.py"

@@ -55,6 +55,7 @@ def test_the_tutorial_builds_one_of_each():
 RUNS = ("one_post/softgm", "structured/mappo_deep_sets", "one_post/reinforce_deep_sets")
 
 
+@pytest.mark.slow
 def test_the_commands_of_the_tutorial_do_what_it_says(place):
     for command in COMMANDS:
         result = run(place, command, **{VARIABLE: "my_project"})
@@ -135,6 +136,7 @@ print("checked")
 """
 
 
+@pytest.mark.slow
 def test_what_the_tutorial_builds_has_the_properties_that_it_states(place):
     result = subprocess.run(
         [sys.executable, "-c", CHECKS],

@@ -30,6 +30,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return python
 
 
+@pytest.mark.slow
 def test_it_trains_evaluates_and_draws_away_from_the_repository(installed: Path, tmp_path: Path):
     where = _run(installed, tmp_path, "-c", "import softgm_bench; print(softgm_bench.__file__)")
     assert Path(where.strip()).is_relative_to(installed.parents[1])

@@ -41,6 +41,7 @@ def made(tmp_path_factory):
     return root
 
 
+@pytest.mark.slow
 def test_the_committed_report_is_what_the_committed_runs_give(tmp_path, monkeypatch):
     made_with = json.loads((COMMITTED / "made_with.json").read_text())
     if made_with["matplotlib"] != matplotlib.__version__:
@@ -53,6 +54,7 @@ def test_the_committed_report_is_what_the_committed_runs_give(tmp_path, monkeypa
     assert [name for name in made if made[name] != committed[name]] == []
 
 
+@pytest.mark.slow
 def test_the_same_runs_give_the_same_bytes_in_another_process(made, tmp_path):
     command = [sys.executable, "-m", "softgm_bench.report", "runs", f"out={tmp_path}", "resamples=200"]
     subprocess.run(command, cwd=made, check=True, capture_output=True)

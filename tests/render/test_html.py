@@ -371,6 +371,7 @@ def browse(page: str, *options: str) -> subprocess.CompletedProcess:
     return subprocess.run(command, capture_output=True, text=True, timeout=240)
 
 
+@pytest.mark.slow
 def test_a_browser_shows_arm_post_and_target_without_a_word_on_the_console(tmp_path, episode):
     image = pytest.importorskip("matplotlib.image", reason="matplotlib reads the screenshot")
     write_html(episode, tmp_path / "page.html")
@@ -386,6 +387,7 @@ def test_a_browser_shows_arm_post_and_target_without_a_word_on_the_console(tmp_p
     assert ((red > 0.75) & (green > 0.5) & (blue < 0.35)).sum() > 15  # the target
 
 
+@pytest.mark.slow
 def test_a_browser_without_webgl_draws_simply_and_says_so(tmp_path, episode):
     write_html(episode, tmp_path / "page.html")
     done = browse(f"file://{tmp_path}/page.html#step=20", "--disable-3d-apis", "--dump-dom")

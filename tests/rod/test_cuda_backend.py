@@ -33,6 +33,7 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str | 
     return results
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in NAMES if name.startswith("test_")])
 def test_simulated(simulated: dict[str, list[str | None]], name: str):
     results = simulated[name]

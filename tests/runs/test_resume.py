@@ -180,6 +180,7 @@ def test_an_evaluation_that_a_signal_broke_off_is_made_up_for(tmp_path, whole, m
     assert written(tmp_path) == written(whole)
 
 
+@pytest.mark.slow
 def test_a_process_that_is_killed_again_and_again_finishes_the_run(tmp_path, whole):
     metrics, chance = tmp_path / "metrics.csv", random.Random()
     kills = 0
@@ -203,6 +204,7 @@ def test_a_process_that_is_killed_again_and_again_finishes_the_run(tmp_path, who
     assert differences(state(tmp_path), state(whole)) == []
 
 
+@pytest.mark.slow
 def test_it_may_be_killed_at_the_worst_moments(tmp_path, whole):
     moments = [
         ("config.yaml", True),  # before there is a run
@@ -303,6 +305,7 @@ echo "$first $second $third"
 """
 
 
+@pytest.mark.slow
 def test_a_run_whose_disk_was_full_goes_on_where_there_is_room_again(tmp_path, whole):
     """The commands themselves, on a disk of their own with room for two checkpoints and a half."""
     (tmp_path / "disk").mkdir()

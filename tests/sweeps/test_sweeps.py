@@ -80,6 +80,7 @@ def no_process_left(folder):
     return all(sweep_record.state(path.parent).kind != "running" for path in folder.rglob("output.log"))
 
 
+@pytest.mark.slow
 def test_a_killed_training_fails_alone_and_is_retried_alone(tmp_path):
     seeds = tmp_path / "outputs/basic/softgm"
     if not sweep.installed("joblib"):
@@ -109,6 +110,7 @@ def test_a_killed_training_fails_alone_and_is_retried_alone(tmp_path):
     assert sorted(path.name for path in (tmp_path / "outputs").iterdir()) == ["basic", "multirun.yaml"]
 
 
+@pytest.mark.slow
 def test_a_sweep_that_is_killed_takes_its_trainings_along(tmp_path):
     if not sweep.installed("joblib"):
         pytest.skip("hydra-joblib-launcher is not installed")
