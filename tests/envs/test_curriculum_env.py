@@ -91,7 +91,7 @@ def test_who_does_not_ask_for_it_or_has_none_enabled_gets_the_same_bits_as_witho
 def test_at_the_last_stage_whole_episodes_are_the_tasks_own_bit_for_bit(build, task):
     plain = build(task, curriculum=False, horizon=3, substeps=10)
     eased = build(task, ENABLED, "task.curriculum.demote=0.0", horizon=3, substeps=10)
-    edit(eased, lambda state: state["curriculum", "stage"].fill_(10))
+    edit(eased, lambda state: state["progress", "stage"].fill_(10))
     eased.set_seed(0)
     plain.set_seed(0)
     expected, found = play(plain, 7), play(eased, 7)
@@ -127,7 +127,7 @@ def test_a_round_of_successes_is_a_stage_and_the_last_frames_keep_their_own_diff
 
 def test_a_round_of_failures_is_a_stage_back(build):
     env = build("basic", ENABLED, ROUND, "task.curriculum.stages=4", horizon=1)
-    edit(env, lambda state: state["curriculum", "stage"].fill_(3))
+    edit(env, lambda state: state["progress", "stage"].fill_(3))
     td, seen = env.reset(), []
     for _ in range(5):
         seen.append(td[entries.DIFFICULTY].unique().item())
@@ -137,7 +137,7 @@ def test_a_round_of_failures_is_a_stage_back(build):
 
 def test_broken_episodes_are_failures(build):
     env = build("basic", ENABLED, ROUND, "task.curriculum.stages=4")
-    edit(env, lambda state: state["curriculum", "stage"].fill_(2))
+    edit(env, lambda state: state["progress", "stage"].fill_(2))
     td = env.reset()
     put_targets_at_the_tips(env, [0, 1, 2, 3])
     edit(env, lambda state: state["episodes", "rod", "velocity"].fill_(float("nan")))
@@ -172,7 +172,7 @@ def test_a_partial_reset_at_another_difficulty_changes_no_bit_of_the_others(buil
         for step, action in enumerate(actions(env, 4)):
             td = env.step(td.clone().set(entries.ACTION, action))["next"].exclude("reward")
             if reset and step == 1:
-                edit(env, lambda state: state["curriculum", "stage"].fill_(7))
+                edit(env, lambda state: state["progress", "stage"].fill_(7))
                 td = env.reset(td.set("_reset", torch.tensor([[False], [True], [False], [False]])))
         return td
 

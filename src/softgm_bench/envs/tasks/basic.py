@@ -18,6 +18,7 @@ from softgm_bench.envs.tasks.base import (
     redraw_until,
     uniform,
 )
+from softgm_bench.envs.tasks.registry import register_task
 
 
 @dataclass
@@ -39,6 +40,7 @@ class BasicConfig(TaskConfig):
     curriculum: BasicCurriculumConfig
 
 
+@register_task("basic")
 class Basic(Task):
     """Any azimuth; distance and polar angle from +z uniform in their ranges."""
 

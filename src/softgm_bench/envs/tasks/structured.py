@@ -16,6 +16,7 @@ from softgm_bench.envs.tasks.base import (
     uniform_box,
     upright_cylinders,
 )
+from softgm_bench.envs.tasks.registry import register_task
 
 
 @dataclass
@@ -41,6 +42,7 @@ class StructuredConfig(TaskConfig):
     curriculum: StructuredCurriculumConfig
 
 
+@register_task("structured")
 class Structured(Task):
     """The posts stand still; only the target is drawn."""
 

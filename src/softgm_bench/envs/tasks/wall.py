@@ -18,6 +18,7 @@ from softgm_bench.envs.tasks.base import (
     uniform_box,
     upright_cylinders,
 )
+from softgm_bench.envs.tasks.registry import register_task
 from softgm_bench.rod.state import Cylinders
 
 
@@ -48,6 +49,7 @@ class WallConfig(TaskConfig):
     curriculum: WallCurriculumConfig
 
 
+@register_task("wall", "wall_narrow", "wall_fixed")
 class Wall(Task):
     """Columns whose axis lies within half a side of the opening's centre are cut above and below it.
 
