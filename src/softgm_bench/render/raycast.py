@@ -142,7 +142,7 @@ def _backdrop(x, y):
 
 @jit
 def _floor(drawing, px, py):
-    """How much of the floor's light is taken by shadows, 0 to 1; there is nothing else to see of the floor."""
+    """The part of the floor's light that shadows take, 0 to 1; there is nothing else to see of the floor."""
     lit = lit_part(drawing, px, py, drawing.floor)
     around = open_part(drawing, px, py, drawing.floor, 0.0, 0.0, 1.0)
     return 1.0 - (0.62 + 0.38 * lit) * (0.45 + 0.55 * around)

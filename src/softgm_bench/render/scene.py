@@ -174,7 +174,7 @@ class Stage:
             parts.block(cone, CYLINDER, SEEN_THROUGH if self.wall else 1.0)
 
     def _cylinder_colour(self, c: int, step: float) -> tuple[Array, Array]:
-        """Where a cylinder is discovered, from 0 to 1, ``(TEXELS,)``, and its colour, ``(TEXELS, 3)``."""
+        """A cylinder's discovered part, from 0 to 1, ``(TEXELS,)``, and its colour, ``(TEXELS, 3)``, by texel."""
         length, seen = float(self.trajectory.cylinders["length"][c]), self.first_seen[c]
         first = seen[np.minimum((_PLACE * length / self.bin_length).astype(int), len(seen) - 1)]
         known = (first <= step).astype(np.float64)

@@ -65,7 +65,7 @@ def texture_at(drawing, cone, y):
 
 @jit
 def lit_part(drawing, px, py, pz):
-    """How much of the key light reaches a point, 0 to 1.
+    """The part of the key light that reaches a point, 0 to 1.
 
     Seen from the point the light is a disc. A round cone that passes at some distance from the middle of the disc hides
     a part of it that grows smoothly with depth and width, so there is no noise.
@@ -108,7 +108,7 @@ def lit_part(drawing, px, py, pz):
 
 @jit
 def open_part(drawing, px, py, pz, nx, ny, nz):
-    """How much ambient light reaches a point p with unit normal n, 0 to 1: arm and cylinders near it take some."""
+    """The part of the ambient light, 0 to 1, that arm and cylinders leave to a point p with unit normal n."""
     cell = cell_of(drawing.near_grid, px, py, pz)
     if cell < 0:
         return 1.0

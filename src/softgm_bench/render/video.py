@@ -26,7 +26,7 @@ def natural_speed(duration: float) -> float:
 
 
 def moments(steps: int, control_dt: float, fps: int, speed: float) -> NDArray[np.float64]:
-    """When the frames are, in control steps: from 0 to ``steps``, then the last moment for ``HOLD`` seconds."""
+    """The frames' times in control steps: from 0 to ``steps``, then the last moment for ``HOLD`` seconds."""
     frames = int(np.floor(steps * control_dt * fps / speed + 1e-9))
     moving = np.arange(frames + 1) * (speed / (fps * control_dt))
     return np.concatenate([np.minimum(moving, steps), np.full(round(HOLD * fps), float(steps))])

@@ -32,7 +32,7 @@ async function readEpisode() {
     count(steps + 1).map((step) => vec(arrays.position, 3 * (step * nodes + node))), false, "catmullrom",
   ));
   // sums over the steps before; the state of step 0 has earned nothing
-  const summed = (row) => row.reduce((sums, value) => [...sums, sums[sums.length - 1] + value], [0]);
+  const summed = (row, sum = 0) => [0, ...Array.from(row, (value) => (sum += value))];
   return {
     ...arrays, ...episode, target, contact, courses,
     agents: episode.agentNodes.length,
@@ -43,8 +43,8 @@ async function readEpisode() {
     edge: (step, agent, slot) => edge(step, agent * slots.length + slot),
     distance: courses[nodes - 1].points.map((tip) => tip.distanceTo(target)),
     touching: count(steps + 1).map((step) => count(nodes).reduce((sum, node) => sum + contact(step, node), 0)),
-    returned: summed(Array.from(arrays.reward)),
-    earned: episode.terms.map((_, k) => summed(Array.from(arrays.terms.subarray(k * steps, (k + 1) * steps)))),
+    returned: summed(arrays.reward),
+    earned: episode.terms.map((_, k) => summed(arrays.terms.subarray(k * steps, (k + 1) * steps))),
   };
 }
 
