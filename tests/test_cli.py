@@ -8,6 +8,8 @@ import time
 
 import pytest
 
+from softgm_bench.storage.run_folder import RunFolder
+
 TINY = [
     "experiment=smoke",
     "experiment.total_frames=16",
@@ -111,7 +113,7 @@ def test_an_interrupted_run_says_where_its_checkpoint_is(tmp_path, number, code)
     assert process.returncode == code
     assert "Traceback" not in errors
     last = [line for line in errors.splitlines() if line.strip()][-1]
-    path = checkpoint.latest(metrics.parent / "checkpoints")
+    path = RunFolder(metrics.parent).newest()
     assert last.startswith("softgm_bench: interrupted after ")
     assert last.endswith(str(path.relative_to(tmp_path)))
     state = checkpoint.load(path)

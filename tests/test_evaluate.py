@@ -6,16 +6,20 @@ import json
 import shutil
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from softgm_bench import evaluate
 from softgm_bench.episodes import folder as evaluation_folder
 from softgm_bench.episodes.evaluation import EpisodeRecords
 from softgm_bench.runs import checkpoint
+from softgm_bench.storage import archive
+
+# The command; the package's own name ``evaluate`` is the function.
+evaluate = import_module("softgm_bench.evaluate")
 
 POLICIES = Path(__file__).parents[1] / "experiments" / "policies"
 SOFTGM, MAPPO = str(POLICIES / "basic_softgm.pt"), str(POLICIES / "basic_mappo.pt")
@@ -118,7 +122,7 @@ def test_a_run_keeps_its_evaluations_and_a_file_has_them_elsewhere(run, tmp_path
     (tmp_path / "run/checkpoints").mkdir(parents=True)
     kept = tmp_path / "run/checkpoints/frames-000000000007.pt"
     shutil.copy(SOFTGM, kept)
-    frames, small = checkpoint.load(kept)["frames"], "n_elements-20"
+    frames, small = archive.load(kept)["frames"], "n_elements-20"
     expected = {
         (
             "run",
@@ -196,7 +200,10 @@ MISTAKES = {
     "no discount": ([SOFTGM, "gamma=1.5"], "gamma=1.5: it must lie between 0 and 1"),
     "too many threads": ([SOFTGM, "threads=1000"], "threads=1000: choose 1 to "),
     "no such device": ([SOFTGM, "device=tpu"], "device=tpu: choose cpu, cuda or cuda:<index>"),
-    "the other device's kernel": ([SOFTGM, "backend=cuda"], "backend=cuda runs on a CUDA device: add device=cuda"),
+    "the other device's kernel": (
+        [SOFTGM, "backend=cuda"],
+        "backend=cuda does not run on device=cpu: choose device=cuda",
+    ),
     "a file in the way": (
         [SOFTGM, "out=cut.pt/x"],
         "out=cut.pt/x: Not a directory; choose a folder that can be written",
@@ -211,7 +218,7 @@ def test_a_mistake_is_answered_by_one_line_and_leaves_nothing_behind(run, tmp_pa
     (tmp_path / "empty").mkdir()
     (tmp_path / "cut.pt").write_bytes(content[:middle])
     (tmp_path / "flipped.pt").write_bytes(content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :])
-    torch.save({"format": checkpoint.FORMAT, "frames": 1, "config": 3}, tmp_path / "bare.pt")
+    torch.save({"format": checkpoint.FORMATS[-1], "frames": 1, "config": 3}, tmp_path / "bare.pt")
     before = sorted(path.name for path in tmp_path.iterdir())
 
     status, out, err = run(*arguments)

@@ -100,7 +100,7 @@ class Mischief:
 
 def test_nothing_in_a_file_is_run(tmp_path: Path):
     mark = tmp_path / "was_here"
-    torch.save({"format": checkpoint.FORMAT, "frames": 0, "policy": Mischief(mark)}, tmp_path / "bad.pt")
+    torch.save({"format": checkpoint.FORMATS[-1], "frames": 0, "policy": Mischief(mark)}, tmp_path / "bad.pt")
     np.savez(tmp_path / "bad.npz", metadata=np.array(Mischief(mark), dtype=object))
     for load, name in ((policy.load, "bad.pt"), (checkpoint.load, "bad.pt"), (trajectory.load, "bad.npz")):
         with pytest.raises(UserError, match=r"^[^\n]+$"):

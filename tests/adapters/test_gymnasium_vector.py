@@ -1,20 +1,16 @@
 """The Gymnasium adapters keep Gymnasium's contract and repeat ``SoftArmEnv`` bit by bit."""
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
-
-from softgm_bench.config import UserError
-from softgm_bench.envs import entries, make_env
-
-pytest.importorskip("gymnasium", reason="an optional extra: pip install 'softgm-bench[pettingzoo]'")
-
-import gymnasium
 from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 from softgm_bench.adapters.gymnasium_vector import SoftArmGymnasiumEnv, SoftArmVectorEnv, register
+from softgm_bench.config import UserError
+from softgm_bench.envs import entries, make_env
 from softgm_bench.envs.tasks import TASKS
 
 ENVS = 5

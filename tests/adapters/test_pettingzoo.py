@@ -1,24 +1,19 @@
 """The PettingZoo adapter keeps PettingZoo's contract and repeats ``SoftArmEnv`` bit by bit."""
 
-import importlib
 import sys
 
 import numpy as np
 import pytest
 import torch
-
-from softgm_bench.config import UserError
-from softgm_bench.envs import entries, make_env
-from softgm_bench.models.graph import flat_features, flat_observation
-
-pytest.importorskip("pettingzoo", reason="PettingZoo is an optional extra: pip install 'softgm-bench[pettingzoo]'")
-
 from gymnasium.spaces import Box, MultiBinary
 from gymnasium.utils.env_checker import data_equivalence
 from pettingzoo.test import parallel_api_test, parallel_seed_test
 from torchrl.envs import PettingZooWrapper, check_env_specs
 
 from softgm_bench.adapters.pettingzoo import parallel_env
+from softgm_bench.config import UserError
+from softgm_bench.envs import entries, make_env
+from softgm_bench.models.graph import flat_features, flat_observation
 
 QUICK = "rod.substeps=10"  # a tenth of a control step: these tests are about the adapter
 LEAN = np.array([[1.0, 0.0]] * 6, dtype=np.float32)  # all sections towards the wall
@@ -304,12 +299,3 @@ def test_steps_that_cannot_be_are_refused():
     env.step(actions)
     with pytest.raises(ValueError, match=r"reset\(\)"):
         env.step({})
-
-
-@pytest.mark.parametrize("package", ["pettingzoo", "gymnasium"])
-def test_without_the_extra_one_line_tells_how_to_install_it(monkeypatch, package):
-    for name in ("pettingzoo", "gymnasium_vector"):
-        monkeypatch.delitem(sys.modules, f"softgm_bench.envs.{name}", raising=False)
-    monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(ImportError, match=r"pip install 'softgm-bench\[pettingzoo\]'"):
-        importlib.import_module("softgm_bench.adapters.pettingzoo")

@@ -58,7 +58,7 @@ def test_the_backend_is_the_devices_fused_kernel_unless_one_is_named_and_the_pre
     assert config.backend is None
     env = make_env(config.task, config.rod, 1, 0, dtype=dtype_of(config))
     assert isinstance(env.backend, NumbaBackend)
-    assert env.simulation_state()["rod", "position"].dtype == torch.float32
+    assert env.simulation_state()["episodes", "rod", "position"].dtype == torch.float32
     assert env.reset()["tip"].dtype == torch.float32
     assert dtype_of(compose([])) == torch.float64
 

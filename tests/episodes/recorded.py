@@ -5,10 +5,9 @@ from functools import cache
 import torch
 from tensordict.nn import TensorDictModuleBase
 
-from softgm_bench.algorithms import build_algorithm
-from softgm_bench.assembly import build_env
+from softgm_bench.assembly import build_policy
 from softgm_bench.config import compose
-from softgm_bench.envs import entries
+from softgm_bench.envs import entries, kind_of
 from softgm_bench.episodes import policy, recording, trajectory
 
 WALL = ("task=wall", "task.wall_x=0.2")  # near enough to be touched by the arm's middle soon
@@ -30,7 +29,7 @@ class Leaning(TensorDictModuleBase):
 @cache
 def leaning(*overrides: str) -> policy.TrainedPolicy:
     config = compose([*overrides])
-    return policy.TrainedPolicy(Leaning(), config, 0, {}, config)
+    return policy.TrainedPolicy(Leaning(), kind_of(config.task).sizes(config.task), config, 0, {}, config)
 
 
 @cache
@@ -38,8 +37,8 @@ def untrained(*overrides: str) -> policy.TrainedPolicy:
     config = compose([*overrides])
     with torch.random.fork_rng([]):
         torch.manual_seed(0)
-        algorithm = build_algorithm(config.algo, config.model, build_env(config, 1, 0), config.oracle)
-    return policy.TrainedPolicy(algorithm.policy, config, 0, {}, config)
+        sizes = kind_of(config.task).sizes(config.task)
+        return policy.TrainedPolicy(build_policy(config, sizes), sizes, config, 0, {}, config)
 
 
 @cache

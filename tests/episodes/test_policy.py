@@ -10,6 +10,7 @@ from softgm_bench.envs import entries, make_env
 from softgm_bench.episodes import policy
 from softgm_bench.runs import checkpoint
 from softgm_bench.runs.loop import train
+from softgm_bench.storage.run_folder import RunFolder
 
 TINY = (
     "experiment=smoke",
@@ -46,7 +47,7 @@ def actions(trained):
 
 def test_a_kept_policy_acts_as_the_runs_and_is_small(run, tmp_path):
     of_run = policy.load(run)
-    newest = checkpoint.latest(run / "checkpoints")
+    newest = RunFolder(run).newest()
     policy.save(of_run, tmp_path / "kept.pt")
     kept = policy.load(tmp_path / "kept.pt")
     assert torch.equal(actions(of_run), actions(kept))
@@ -58,7 +59,7 @@ def test_a_kept_policy_acts_as_the_runs_and_is_small(run, tmp_path):
 
 def test_the_policy_is_the_trained_one(run):
     trained = policy.load(run)
-    state = checkpoint.load(checkpoint.latest(run / "checkpoints"))["algorithm"]["loss"]
+    state = checkpoint.load(RunFolder(run).newest())["algorithm"]["loss"]
     values = [value for name, value in state.items() if name.startswith(("actor_network.", "actor_network_params."))]
     stored = sum(value.sum() for value in values if value.is_floating_point())
     torch.testing.assert_close(sum(value.sum() for value in trained.policy.parameters()).detach(), stored)
@@ -67,7 +68,7 @@ def test_the_policy_is_the_trained_one(run):
 def test_what_holds_no_policy_is_refused_in_one_line(run, tmp_path):
     with pytest.raises(UserError, match=r"^\S+: no checkpoint here[^\n]*$"):
         policy.load(tmp_path)
-    state = checkpoint.load(checkpoint.latest(run / "checkpoints"))
+    state = checkpoint.load(RunFolder(run).newest())
     state["config"]["model"]["hidden"] = 64
     torch.save(state, tmp_path / "other.pt")
     with pytest.raises(UserError, match=r"^\S+: this version cannot build its networks[^\n]*$"):
@@ -110,7 +111,7 @@ def test_a_policy_with_settings_is_kept_as_it_was_trained(run, tmp_path):
 
 
 def test_from_a_kept_file_too_a_policy_explores_as_at_the_end_of_training(run, tmp_path):
-    state = checkpoint.load(checkpoint.latest(run / "checkpoints"))
+    state = checkpoint.load(RunFolder(run).newest())
     of_run = policy.load(run)
     policy.save(of_run, tmp_path / "kept.pt")
     kept = policy.load(tmp_path / "kept.pt")

@@ -11,6 +11,7 @@ from pathlib import Path
 import torch
 
 from softgm_bench.runs import checkpoint
+from softgm_bench.storage.run_folder import RunFolder
 
 TINY = (
     "experiment=smoke",
@@ -85,7 +86,7 @@ def written(folder):
 
 def state(folder):
     """The newest checkpoint of a run, without what depends on the clock, the folder and how often it was begun."""
-    held = checkpoint.load(checkpoint.latest(folder / "checkpoints"))
+    held = checkpoint.load(RunFolder(folder).newest())
     held["counters"].pop("wall_time")
     held.pop("config")
     return held

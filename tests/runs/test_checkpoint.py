@@ -3,6 +3,7 @@ import torch
 
 from softgm_bench.config import UserError
 from softgm_bench.runs import checkpoint
+from softgm_bench.storage.run_folder import RunFolder
 
 
 def a_state():
@@ -17,10 +18,15 @@ def a_state():
     }
 
 
+def folder(path):
+    (path / "checkpoints").mkdir(exist_ok=True)
+    return RunFolder(path)
+
+
 def test_what_is_saved_is_loaded_bit_for_bit(tmp_path):
     state = a_state()
 
-    loaded = checkpoint.load(checkpoint.save(tmp_path, 640, state, keep=2))
+    loaded = checkpoint.load(checkpoint.save(folder(tmp_path), 640, state, keep=2))
 
     assert loaded["frames"] == 640
     assert loaded["config"] == state["config"]
@@ -32,15 +38,15 @@ def test_what_is_saved_is_loaded_bit_for_bit(tmp_path):
 
 
 def test_only_the_newest_are_kept_in_the_order_of_frames(tmp_path):
-    paths = [checkpoint.save(tmp_path, frames, {}, keep=2) for frames in (900, 1000, 20000)]
+    paths = [checkpoint.save(folder(tmp_path), frames, {}, keep=2) for frames in (900, 1000, 20000)]
 
-    assert sorted(tmp_path.iterdir()) == paths[1:]
-    assert checkpoint.latest(tmp_path) == paths[-1]
-    assert checkpoint.latest(tmp_path / "nowhere") is None
+    assert sorted(folder(tmp_path).checkpoints.iterdir()) == paths[1:]
+    assert folder(tmp_path).newest() == paths[-1]
+    assert RunFolder(tmp_path / "nowhere").newest() is None
 
 
 def test_damaged_foreign_and_missing_files_are_refused_in_one_line(tmp_path):
-    path = checkpoint.save(tmp_path, 1, a_state(), keep=1)
+    path = checkpoint.save(folder(tmp_path), 1, a_state(), keep=1)
     whole = path.read_bytes()
     foreign = tmp_path / "foreign.pt"
     torch.save({"weights": torch.ones(2)}, foreign)
@@ -64,7 +70,7 @@ class Bomb:
 
 def test_loading_runs_no_code_from_the_file(tmp_path, capsys):
     path = tmp_path / "bomb.pt"
-    torch.save({"format": checkpoint.FORMAT, "bomb": Bomb()}, path)
+    torch.save({"format": checkpoint.FORMATS[-1], "bomb": Bomb()}, path)
 
     with pytest.raises(UserError):
         checkpoint.load(path)

@@ -15,6 +15,7 @@ from softgm_bench.envs import entries, make_env
 from softgm_bench.rod.parameters import RodParameters
 from softgm_bench.runs import checkpoint
 from softgm_bench.runs.loop import train
+from softgm_bench.storage.run_folder import RunFolder
 
 TASKS = ("basic", "structured", "wall", "wall_narrow", "wall_fixed")
 ALGORITHMS = tuple(algorithm_configs())
@@ -61,7 +62,7 @@ def check_run(folder, algo, *overrides):
     assert summary["algo"].startswith(algo)
     assert summary["frames"] == 16
     assert summary["final_evaluation"]["episodes"] == 2
-    state = checkpoint.load(checkpoint.latest(folder / "checkpoints"))
+    state = checkpoint.load(RunFolder(folder).newest())
     assert state["config"]["algo"]["name"] == algo
     return summary
 

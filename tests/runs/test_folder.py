@@ -1,5 +1,3 @@
-import json
-
 import pytest
 
 from softgm_bench.config import UserError
@@ -36,24 +34,3 @@ def test_a_folder_under_a_regular_file_is_refused_in_one_line(tmp_path):
 
     with pytest.raises(UserError, match=r"^run_dir=.*file/run: Not a directory; choose [^\n]*$"):
         run_folder.create(str(tmp_path / "file" / "run"), CONFIG, overwrite=False)
-
-
-def test_a_write_that_fails_leaves_the_old_content_and_no_litter(tmp_path, monkeypatch):
-    path = tmp_path / "summary.json"
-    run_folder.write_atomically(path, b"old")
-
-    def full(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(run_folder.os, "fsync", full)
-    with pytest.raises(OSError, match="No space"):
-        run_folder.write_atomically(path, b"new")
-
-    assert path.read_bytes() == b"old"
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_json_is_valid_where_numbers_are_not():
-    text = run_folder.to_json({"a": float("nan"), "b": [1.5, float("inf")], "c": {"d": True}})
-
-    assert json.loads(text) == {"a": None, "b": [1.5, None], "c": {"d": True}}

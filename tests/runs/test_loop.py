@@ -12,6 +12,7 @@ from softgm_bench.runs import checkpoint
 from softgm_bench.runs.loop import train
 from softgm_bench.runs.machine import set_threads
 from softgm_bench.runs.run import derive_seeds
+from softgm_bench.storage.run_folder import RunFolder
 
 TINY = (
     "experiment=smoke",
@@ -66,8 +67,7 @@ def test_a_perturbation_acts_in_training_too_and_its_state_is_kept(tmp_path):
     assert all(one["loss_critic"] != other["loss_critic"] for one, other in zip(plain, noisy, strict=True))
     assert json.loads((tmp_path / "noisy/summary.json").read_text())["algo"] == "softgm_noise"
     generators = [
-        checkpoint.load(checkpoint.latest(tmp_path / name / "checkpoints"))["environment"]["generator"]
-        for name in ("plain", "noisy")
+        checkpoint.load(RunFolder(tmp_path / name).newest())["environment"]["generator"] for name in ("plain", "noisy")
     ]
     assert generators[1].shape == (2, *generators[0].shape)
 
@@ -127,13 +127,13 @@ def test_settings_that_only_the_algorithm_can_refuse_are_one_line_and_leave_noth
 def test_a_checkpoint_holds_what_going_on_needs(tmp_path):
     train(compose([*TINY, f"run_dir={tmp_path}", "task=wall"]))
 
-    state = checkpoint.load(checkpoint.latest(tmp_path / "checkpoints"))
+    state = checkpoint.load(RunFolder(tmp_path).newest())
 
     assert state["frames"] == 48
     assert state["counters"]["iteration"] == 3
     assert state["config"]["model"]["name"] == "softgm"
-    assert state["environment"]["simulation"]["rod"]["position"].shape[0] == 4
-    assert state["environment"]["simulation"]["rod"]["position"].dtype == torch.float64
+    assert state["environment"]["simulation"]["episodes"]["rod"]["position"].shape[0] == 4
+    assert state["environment"]["simulation"]["episodes"]["rod"]["position"].dtype == torch.float64
     assert {"loss", "actor_optimizer", "critic_optimizer"} <= state["algorithm"].keys()
 
 

@@ -19,6 +19,7 @@ from softgm_bench.config import UserError, compose
 from softgm_bench.runs import checkpoint, loop
 from softgm_bench.runs.interruption import Interrupted
 from softgm_bench.runs.metrics import CsvWriter
+from softgm_bench.storage.run_folder import RunFolder
 
 OFF_POLICY = (
     "algo.batch_size=8",
@@ -146,7 +147,7 @@ def test_without_the_replay_gradient_steps_pause_until_it_has_filled_again(tmp_p
 
 
 def test_the_clock_goes_on_from_the_checkpoint(broken):
-    before = checkpoint.load(checkpoint.latest(broken / "checkpoints"))["counters"]["wall_time"]
+    before = checkpoint.load(RunFolder(broken).newest())["counters"]["wall_time"]
     time.sleep(0.5)  # between the two
     began = time.perf_counter()
     summary = train(broken, *SMALL, "resume=true")
@@ -230,7 +231,7 @@ def test_it_may_be_killed_at_the_worst_moments(tmp_path, whole):
 
 
 def test_a_damaged_checkpoint_is_passed_over_in_one_line(broken, whole, capsys):
-    newest = checkpoint.latest(broken / "checkpoints")
+    newest = RunFolder(broken).newest()
     newest.write_bytes(newest.read_bytes()[:-100])
     capsys.readouterr()
 
@@ -243,7 +244,7 @@ def test_a_damaged_checkpoint_is_passed_over_in_one_line(broken, whole, capsys):
 
 
 def test_if_all_checkpoints_are_damaged_nothing_is_lost(broken):
-    for path in checkpoint.in_order(broken / "checkpoints"):
+    for path in RunFolder(broken).in_order():
         path.write_bytes(b"")
     before = {path: path.read_bytes() for path in broken.rglob("*") if path.is_file()}
 
@@ -253,12 +254,14 @@ def test_if_all_checkpoints_are_damaged_nothing_is_lost(broken):
 
 
 def test_a_damaged_checkpoint_does_not_push_out_the_whole_ones(tmp_path):
-    paths = [checkpoint.save(tmp_path, frames, {}, keep=2) for frames in (100, 300)]
+    folder = RunFolder(tmp_path)
+    folder.checkpoints.mkdir()
+    paths = [checkpoint.save(folder, frames, {}, keep=2) for frames in (100, 300)]
     paths[1].write_bytes(b"damaged")
 
-    assert sorted(tmp_path.iterdir()) == sorted([paths[0], paths[1]])
-    newer = checkpoint.save(tmp_path, 200, {}, keep=2)
-    assert sorted(tmp_path.iterdir()) == [paths[0], newer]
+    assert sorted(folder.checkpoints.iterdir()) == sorted([paths[0], paths[1]])
+    newer = checkpoint.save(folder, 200, {}, keep=2)
+    assert sorted(folder.checkpoints.iterdir()) == [paths[0], newer]
 
 
 def test_without_a_checkpoint_it_begins_anew_and_says_so(tmp_path, whole, capsys):
@@ -281,7 +284,7 @@ def test_rows_that_are_missing_are_not_papered_over(broken):
 
 
 def test_a_checkpoint_of_another_version_is_refused_in_one_line(broken):
-    newest = checkpoint.latest(broken / "checkpoints")
+    newest = RunFolder(broken).newest()
     held = checkpoint.load(newest)
     del held["environment"]["shown"]
     torch.save(held, newest)
@@ -309,7 +312,7 @@ echo "$first $second $third"
 def test_a_run_whose_disk_was_full_goes_on_where_there_is_room_again(tmp_path, whole):
     """The commands themselves, on a disk of their own with room for two checkpoints and a half."""
     (tmp_path / "disk").mkdir()
-    size = int(2.5 * checkpoint.latest(whole / "checkpoints").stat().st_size)
+    size = int(2.5 * RunFolder(whole).newest().stat().st_size)
     command = [sys.executable, "-m", "softgm_bench", *SMALL, "run_dir=disk/run"]
     namespace = ["unshare", "--map-root-user", "--mount", "sh", "-c", FULL_DISK, "sh", str(size)]
     if shutil.which("unshare") is None:
@@ -392,7 +395,7 @@ def test_a_folder_without_its_settings_is_not_replaced_by_going_on(broken):
         (broken / "config.yaml").unlink() if content is None else (broken / "config.yaml").write_text(content)
         with pytest.raises(UserError, match=r"config\.yaml: missing or of another version; to begin anew[^\n]*$"):
             train(broken, *SMALL, "resume=true")
-    assert len(checkpoint.in_order(broken / "checkpoints")) == 2
+    assert len(RunFolder(broken).in_order()) == 2
 
 
 def test_two_processes_do_not_write_the_same_run(broken, whole):

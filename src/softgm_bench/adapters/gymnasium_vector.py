@@ -1,7 +1,4 @@
-"""The arm for Gymnasium: one agent that chooses every section's action, alone or batched in one simulation.
-
-Gymnasium is an optional extra.
-"""
+"""The arm for Gymnasium: one agent that chooses every section's action, alone or batched in one simulation."""
 
 import math
 import operator
@@ -9,8 +6,12 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import gymnasium
 import numpy as np
 import torch
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
 from hydra.errors import HydraException
 from numpy.typing import NDArray
 from omegaconf.errors import OmegaConfBaseException
@@ -22,14 +23,6 @@ from softgm_bench.config import UserError
 from softgm_bench.envs import entries
 from softgm_bench.envs.soft_arm import SoftArmEnv
 from softgm_bench.envs.tasks import TASKS
-
-try:
-    import gymnasium
-    from gymnasium import spaces
-    from gymnasium.vector import AutoresetMode, VectorEnv
-    from gymnasium.vector.utils import batch_space
-except ImportError as error:
-    raise ImportError("Gymnasium is not installed: pip install 'softgm-bench[pettingzoo]'") from error
 
 Array = NDArray[Any]
 SETTINGS = ("task", "rod", "perturbation", "device", "backend", "dtype")  # what an environment alone depends on

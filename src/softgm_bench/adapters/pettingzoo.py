@@ -1,39 +1,34 @@
-"""The arm as a PettingZoo environment: one agent per section, one environment. PettingZoo is an optional extra."""
+"""The arm as a PettingZoo environment: one agent per section, one environment."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, TypeAlias
 
+import gymnasium
 import numpy as np
 import torch
+from gymnasium import spaces
 from numpy.typing import NDArray
+from pettingzoo import ParallelEnv
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded
 
+from softgm_bench.adapters.gymnasium_vector import (
+    build_arm,
+    checked_action,
+    checked_seed,
+    ends,
+    info_columns,
+    info_row,
+    joint_size,
+    joint_view,
+    put_action,
+    real_space,
+)
 from softgm_bench.envs import entries
 from softgm_bench.envs.soft_arm import SoftArmEnv
 from softgm_bench.envs.views import flat_features, flat_observation
-
-try:
-    import gymnasium
-    from gymnasium import spaces
-    from pettingzoo import ParallelEnv
-
-    from softgm_bench.adapters.gymnasium_vector import (
-        build_arm,
-        checked_action,
-        checked_seed,
-        ends,
-        info_columns,
-        info_row,
-        joint_size,
-        joint_view,
-        put_action,
-        real_space,
-    )
-except ImportError as error:
-    raise ImportError("PettingZoo is not installed: pip install 'softgm-bench[pettingzoo]'") from error
 
 Array = NDArray[Any]
 Observation = Array | dict[str, Array]

@@ -135,8 +135,8 @@ def changed(values: Mapping[str, Any], overrides: Sequence[str]) -> Config:
             single.append(override)
         elif re.fullmatch(r"\w+", name):
             composed = compose_untyped([override, f"recipe={settings.get('recipe') or PAPER}"])
-            OmegaConf.resolve(composed)
-            settings[key] = composed[key]
+            chosen: Any = OmegaConf.to_container(composed, resolve=True)
+            settings[key] = chosen[key]
         else:
             raise UserError(f"{override}: name one of the files in conf/{key}")
     try:

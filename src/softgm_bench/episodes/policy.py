@@ -105,7 +105,7 @@ def save(trained: TrainedPolicy, path: Path) -> None:
 def _file(path: Path) -> Path:
     if not path.is_dir():
         return path
-    newest = max(RunFolder(path).in_order(), default=None)
+    newest = RunFolder(path).newest()
     if newest is None:
         raise UserError(f"{path}: no checkpoint here; name a run folder, a checkpoint or a policy's file")
     return newest

@@ -31,6 +31,16 @@ class MLPConfig:
     layers: int
     velocity_scale: float
 
+    def __post_init__(self) -> None:
+        """Refuse values that give no network.
+
+        Raises:
+            ValueError: with one line naming the key, its value and what would be right.
+        """
+        for name, lowest in (("hidden", 1), ("layers", 0)):
+            if getattr(self, name) < lowest:
+                raise ValueError(f"model.{name} is {getattr(self, name)}: it must be at least {lowest}")
+
 
 class MLPTeamEncoder(TeamEncoder):
     """One MLP that reads all agents' flat observations and further inputs, as BenchMARL's centralised critics do.

@@ -54,6 +54,16 @@ class SoftGMConfig:
     residual: bool
     velocity_scale: float
 
+    def __post_init__(self) -> None:
+        """Refuse values that give no network.
+
+        Raises:
+            ValueError: with one line naming the key, its value and what would be right.
+        """
+        for name, lowest in (("hidden", 1), ("heads", 1), ("layers", 0), ("type_embedding", 1)):
+            if getattr(self, name) < lowest:
+                raise ValueError(f"model.{name} is {getattr(self, name)}: it must be at least {lowest}")
+
 
 Affine = tuple[Tensor, Tensor | None]  # weight and offset of a linear map that is still to be applied
 Record = list[Tensor] | None  # where to leave the attention of each layer

@@ -100,7 +100,7 @@ def check_backend(name: str, device_type: str) -> None:
     """
     if runs_on(name, device_type):
         return
-    others = [other for other in BACKENDS if runs_on(other, device_type)]
+    others = [other for other in _REGISTRY if runs_on(other, device_type)]
     instead = f", or backend={' or '.join(others)}" if others else ""
     raise ValueError(
         f"backend={name} does not run on device={device_type}: "

@@ -43,3 +43,7 @@ class RunFolder:
     def in_order(self) -> list[Path]:
         """Give the checkpoints, oldest first."""
         return sorted(self.checkpoints.glob("frames-*.pt"))
+
+    def newest(self) -> Path | None:
+        """Give the newest checkpoint; None if there is none."""
+        return max(self.in_order(), default=None)
