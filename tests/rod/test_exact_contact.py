@@ -14,7 +14,7 @@ from torch import Tensor
 
 from softgm_bench.rod.contact import contact_forces, element_length, element_radius
 from softgm_bench.rod.exact_contact import contact_interval, exact_contact_forces
-from softgm_bench.rod.numba_exact_contact import make_touch_exact
+from softgm_bench.rod.numba_contact import make_touch
 from softgm_bench.rod.numba_layout import make_layout
 from softgm_bench.rod.parameters import RodParameters, rod_constants
 from softgm_bench.rod.state import Cylinders, straight_rods
@@ -341,7 +341,7 @@ def test_masked_cylinders_change_no_bit_and_are_never_read(seed: int, masked: li
 
 
 def numba_forces(position: Tensor, velocity: Tensor, cylinders: Cylinders, parameters: RodParameters, real: type):
-    """What ``make_touch_exact`` adds to an empty buffer, ``(3, n_nodes)``."""
+    """What ``make_touch`` adds to an empty buffer, ``(3, n_nodes)``."""
     n = parameters.n_elements
     layout = make_layout(n, real)
     s = np.zeros(layout.size, real)
@@ -353,7 +353,7 @@ def numba_forces(position: Tensor, velocity: Tensor, cylinders: Cylinders, param
     p = parameters
     per_element = np.array([p.contact_stiffness, p.contact_damping, 0.0, p.velocity_damping_coefficient])
     contact = (per_element / p.contact_length + [0.0, 0.0, p.friction_coefficient, 0.0]).astype(real)
-    touch = make_touch_exact(layout, real)
+    touch = make_touch(layout, real, "exact")
     for c in range(cylinders.mask.shape[1]):
         edge = cylinders.axis[0, c] * cylinders.length[0, c]
         row = np.array([*cylinders.start[0, c], *edge, cylinders.radius[0, c], 0.0], dtype=real)

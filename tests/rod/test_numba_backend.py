@@ -9,10 +9,9 @@ from sharp_bends import beyond_polynomials
 
 from softgm_bench.rod.numba_backend import NumbaBackend
 from softgm_bench.rod.numba_contact import make_contact, make_touch
-from softgm_bench.rod.numba_exact_contact import make_touch_exact
 from softgm_bench.rod.numba_kernel import FASTMATH, make_kernel
 from softgm_bench.rod.numba_layout import make_layout
-from softgm_bench.rod.parameters import RodParameters
+from softgm_bench.rod.parameters import CONTACT_MODELS, RodParameters
 from softgm_bench.rod.state import Cylinders, RodState, dilatation, straight_rods
 from softgm_bench.rod.torch_backend import TorchBackend
 
@@ -188,8 +187,8 @@ def test_float32_kernel_computes_nothing_in_float64():
     }
     for name, signature in signatures.items():
         assert double_arithmetic(getattr(kernel, name), signature) == [], name
-    for touch in (make_touch, make_touch_exact):
-        contact = make_contact(layout, np.float32, touch(layout, np.float32))
+    for model in CONTACT_MODELS:
+        contact = make_contact(layout, np.float32, make_touch(layout, np.float32, model))
         assert double_arithmetic(contact.add_contact, (row, table, real, real, row, real)) == []
 
 

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import config, cuda
 
+from softgm_bench.rod.callees import with_callees
 from softgm_bench.rod.parameters import RodParameters, rod_constants
 from softgm_bench.rod.series import SMALL_BEND, SMALL_EXPONENT, SMALL_TURN, TINY, bend, cosc, exponential, sinc
 
@@ -116,27 +117,13 @@ class Physics(NamedTuple):
     straighten: Callable[..., Any]
 
 
-def device(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile for use inside a kernel; under Numba's simulator the plain function, which is much faster."""
-    return function if SIMULATED else cuda.jit(device=True)(function)
+def device(function: Callable[..., Any], inline: bool = False, **callees: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile for use inside a kernel; under Numba's simulator the plain function, which is much faster.
 
-
-@device
-def smaller(a, b):
-    """The built-in ``min`` is no device function."""
-    return b if b < a else a
-
-
-@device
-def larger(a, b):
-    """The built-in ``max`` is no device function."""
-    return b if b > a else a
-
-
-@device
-def clip(value, low, high):
-    """``value`` within its bounds."""
-    return low if value < low else (high if value > high else value)
+    ``callees`` are bound as ``callees`` says. ``inline`` makes no difference: the GPU's compiler inlines everything.
+    """
+    bound = with_callees(function, callees)
+    return bound if SIMULATED else cuda.jit(device=True)(bound)
 
 
 @lru_cache
@@ -249,7 +236,7 @@ def _make_curvature(real: type) -> Callable[..., Any]:
         y = quarter * (three - trace)  # sin^2(theta / 2)
         ratio = ratio_series(y)  # theta / sin(theta)
         if y > limit:
-            y = smaller(y, largest)
+            y = largest if largest < y else y
             ratio = real(asin(real(sqrt(y)))) / real(sqrt(y * (one - y)))
         scale = -half * ratio * c.inverse_voronoi_length
         return x0 * scale, x1 * scale, x2 * scale

@@ -208,21 +208,21 @@ def _make_act(n: int, real: type, contact: str | None) -> Callable[..., Any]:
         outer_x, outer_y, outer_z, current = zero, zero, zero, c.rest_length
         if k < n:
             i = k + 1
-            ex, ey, ez = node[0, i] - x, node[1, i] - y, node[2, i] - z
-            rx, ry, rz = node[3, i], node[4, i], node[5, i]
+            nx, ny, nz, wx, wy, wz = node[0, i], node[1, i], node[2, i], node[3, i], node[4, i], node[5, i]
             current, fx, fy, fz, m0, m1, m2 = strain(
-                c, ex, ey, ez, rx - vx, ry - vy, rz - vz, q00, q01, q02, q10, q11, q12, q20, q21, q22, w0, w1, w2
-            )
+                c, nx - x, ny - y, nz - z, wx - vx, wy - vy, wz - vz,
+                q00, q01, q02, q10, q11, q12, q20, q21, q22, w0, w1, w2,
+            )  # fmt: skip
             if k < n - 1:
                 k0, k1, k2 = curvature(
                     c, q00, q01, q02, q10, q11, q12, q20, q21, q22, node[6, i], node[7, i], node[8, i],
                     node[9, i], node[10, i], node[11, i], node[12, i], node[13, i], node[14, i],
                 )  # fmt: skip
-            px, py, pz, nx, ny, nz, travelled, next_check, candidates = press(
-                c, k, x, y, z, ex, ey, ez, vx, vy, vz, rx, ry, rz, current, duration, travelled, next_check, candidates,
+            px, py, pz, qx, qy, qz, travelled, next_check, candidates = press(
+                c, k, x, y, z, nx, ny, nz, vx, vy, vz, wx, wy, wz, current, duration, travelled, next_check, candidates,
                 b, start, axis, length, radius, mask,
             )  # fmt: skip
-            outer_x, outer_y, outer_z = nx - fx, ny - fy, nz - fz
+            outer_x, outer_y, outer_z = qx - fx, qy - fy, qz - fz
             fx, fy, fz = fx + px, fy + py, fz + pz
         joint[0, k + 1], joint[1, k + 1], joint[2, k + 1] = outer_x, outer_y, outer_z
         joint[3, k + 1], joint[4, k + 1], joint[5, k + 1], joint[6, k + 1] = k0, k1, k2, current

@@ -13,11 +13,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from softgm_bench.rod.numba_contact import COLUMNS, EDGE, NEXT_CHECK, RADIUS, START, make_contact, make_touch
-from softgm_bench.rod.numba_exact_contact import make_touch_exact
+from softgm_bench.rod.numba_contact import COLUMNS, NEXT_CHECK, make_contact, make_touch
 from softgm_bench.rod.numba_kernel import jit, larger, make_kernel, make_straighten
 from softgm_bench.rod.numba_layout import CACHE_LINE, Layout, constant_rows, make_layout
 from softgm_bench.rod.parameters import CONTACT_MODELS, RodParameters, rod_constants
+from softgm_bench.rod.scalar_contact import EDGE, RADIUS, START
 from softgm_bench.rod.state import Cylinders, RodState, check_inputs
 
 
@@ -142,7 +142,7 @@ def _make_step(n_elements: int, dtype: type, contact_model: str) -> Callable[...
 
 def _make_advance(layout: Layout, real: type, contact_model: str) -> Callable[..., Any]:
     p, n = layout, layout.n
-    touch = (make_touch if contact_model == "pyelastica" else make_touch_exact)(layout, real)
+    touch = make_touch(layout, real, contact_model)
     zero, half, far = real(0.0), real(0.5), real(np.inf)
 
     def advance(s, cylinders, scalars, contact, substeps):

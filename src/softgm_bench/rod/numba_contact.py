@@ -10,6 +10,7 @@ closest-point search. Both screens are bounds, so no contact is missed.
 """
 
 from collections.abc import Callable
+from functools import lru_cache
 from math import sqrt
 from typing import Any, NamedTuple
 
@@ -17,11 +18,11 @@ import numpy as np
 
 from softgm_bench.rod.numba_kernel import jit, larger
 from softgm_bench.rod.numba_layout import Layout
+from softgm_bench.rod.parameters import CONTACT_MODELS
+from softgm_bench.rod.scalar_contact import EDGE, RADIUS, START, make_offset, make_pair
 
-# columns of a cylinder's row
-START, EDGE, RADIUS, NEXT_CHECK, COLUMNS = 0, 3, 6, 7, 8
-# entries of the contact parameters
-STIFFNESS, DAMPING, FRICTION, SLIP_DAMPING = 0, 1, 2, 3
+# columns of a cylinder's row behind those of ``scalar_contact``
+NEXT_CHECK, COLUMNS = 7, 8
 
 
 class Contact(NamedTuple):
@@ -105,113 +106,53 @@ def _make_nearest(layout: Layout, real: type) -> Callable[..., Any]:
             dx = half * (s[p.px + k] + s[p.px + k + 1]) - cx
             dy = half * (s[p.py + k] + s[p.py + k + 1]) - cy
             dz = half * (s[p.pz + k] + s[p.pz + k + 1]) - cz
-            along = min(max((dx * ex + dy * ey + dz * ez) * inverse, zero), one)
-            dx -= along * ex
-            dy -= along * ey
-            dz -= along * ez
+            dx, dy, dz = offset(dx, dy, dz, ex, ey, ez, inverse, zero, one)
             distance2 = dx * dx + dy * dy + dz * dz
             s[p.distance2 + k] = distance2
             smallest = larger(smallest, -distance2)
         return -smallest
 
-    return jit(nearest)
+    return jit(nearest, offset=make_offset(jit))
 
 
-def make_touch(layout: Layout, real: type) -> Callable[..., Any]:
-    """Compile PyElastica's force of one cylinder on one element."""
-    p, n = layout, layout.n
-    zero, third, half, one, two = real(0.0), real(1.0 / 3.0), real(0.5), real(1.0), real(2.0)
-    inverse_pi, tiny, smallest = real(1.0 / np.pi), real(1e-14), real(np.finfo(real).tiny)
+@lru_cache
+def make_touch(layout: Layout, real: type, contact_model: str) -> Callable[..., Any]:
+    """Compile the force of one cylinder on one element for one layout, precision and contact model."""
+    # Code on disk is found by the closure: what differs only in its callees must differ in the layout too.
+    p = layout._replace(source=layout.source + CONTACT_MODELS.index(contact_model))
+    inverse_pi = real(1.0 / np.pi)
 
     def touch(s, k, cylinder, contact, volume):
-        """Force of one cylinder on one element (``_calculate_contact_forces_rod_cylinder``)."""
-        length = s[p.length + k]
-        radius = real(sqrt(volume * inverse_pi / length))
-        dx, dy, dz = closest_points(
-            half * (s[p.px + k] + s[p.px + k + 1]),
-            half * (s[p.py + k] + s[p.py + k + 1]),
-            half * (s[p.pz + k] + s[p.pz + k + 1]),
-            s[p.px + k + 1] - s[p.px + k],
-            s[p.py + k + 1] - s[p.py + k],
-            s[p.pz + k + 1] - s[p.pz + k],
-            cylinder[START],
-            cylinder[START + 1],
-            cylinder[START + 2],
-            cylinder[EDGE],
-            cylinder[EDGE + 1],
-            cylinder[EDGE + 2],
+        """Add the cylinder's force to the element's two nodes; arguments as those of ``add_contact``."""
+        touching, found = meet(
+            s[p.px + k],
+            s[p.py + k],
+            s[p.pz + k],
+            s[p.px + k + 1],
+            s[p.py + k + 1],
+            s[p.pz + k + 1],
+            real(sqrt(volume * inverse_pi / s[p.length + k])),
+            cylinder,
         )
-        distance = real(sqrt(dx * dx + dy * dy + dz * dz))
-        penetration = radius + cylinder[RADIUS] - distance
-        if not penetration > zero:
+        if not touching:
             return
-        inverse = one / max(distance, smallest)  # where the axes cross there is no direction, and no force
-        dx, dy, dz = dx * inverse, dy * inverse, dz * inverse
-        # velocity of the cylinder (at rest) relative to the element
-        ux = -half * (s[p.vx + k] + s[p.vx + k + 1])
-        uy = -half * (s[p.vy + k] + s[p.vy + k + 1])
-        uz = -half * (s[p.vz + k] + s[p.vz + k + 1])
-        normal = ux * dx + uy * dy + uz * dz
-        force = half * (contact[STIFFNESS] * penetration - contact[DAMPING] * normal)
-        fx, fy, fz = force * dx, force * dy, force * dz
-        if contact[FRICTION] > zero:
-            ux, uy, uz = ux - normal * dx, uy - normal * dy, uz - normal * dz
-            slip = real(sqrt(ux * ux + uy * uy + uz * uz))
-            friction = min(contact[SLIP_DAMPING] * slip, contact[FRICTION] * abs(force)) / (slip + tiny)
-            fx, fy, fz = fx - friction * ux, fy - friction * uy, fz - friction * uz
-        # the end elements lean on their free and fixed nodes with half the weight, as in PyElastica
-        first, second = one, one
-        if k == 0:
-            first, second = two * third, two * two * third
-        elif k == n - 1:
-            first, second = two * two * third, two * third
-        s[p.fx + k] -= first * fx
-        s[p.fy + k] -= first * fy
-        s[p.fz + k] -= first * fz
-        s[p.fx + k + 1] -= second * fx
-        s[p.fy + k + 1] -= second * fy
-        s[p.fz + k + 1] -= second * fz
+        fx, fy, fz, gx, gy, gz = forces(
+            found,
+            k,
+            s[p.vx + k],
+            s[p.vy + k],
+            s[p.vz + k],
+            s[p.vx + k + 1],
+            s[p.vy + k + 1],
+            s[p.vz + k + 1],
+            s[p.rest + k],
+            contact,
+        )
+        s[p.fx + k] -= fx
+        s[p.fy + k] -= fy
+        s[p.fz + k] -= fz
+        s[p.fx + k + 1] -= gx
+        s[p.fy + k + 1] -= gy
+        s[p.fz + k + 1] -= gz
 
-    return jit(touch, closest_points=_make_closest_points(real))
-
-
-def _make_closest_points(real: type) -> Callable[..., Any]:
-    zero, one, threshold = real(0.0), real(1.0), real(1e-6)
-
-    def closest_points(x, y, z, ax, ay, az, u, v, w, bx, by, bz):
-        """Vector from the element's segment (x, a) to the cylinder's axis (u, b) at their closest points.
-
-        PyElastica's ``_find_min_dist``, with its threshold for parallel segments.
-        """
-        aa = ax * ax + ay * ay + az * az
-        ab = ax * bx + ay * by + az * bz
-        bb = bx * bx + by * by + bz * bz
-        rx, ry, rz = u - x, v - y, w - z
-        ra = rx * ax + ry * ay + rz * az
-        rb = rx * bx + ry * by + rz * bz
-        determinant = aa * bb - ab * ab
-        if abs(determinant) < threshold * (aa * bb):
-            t = min(max(ra / aa, zero), one)
-            q = min(max((t * ab - rb) / bb, zero), one)
-            return rx + q * bx - t * ax, ry + q * by - t * ay, rz + q * bz - t * az
-        q = (ab * ra - aa * rb) / determinant
-        t = (ab * q + ra) / aa
-        if q < zero or q > one or t < zero or t > one:
-            # the best of the four ends against the other segment
-            q, t = zero, min(max(ra / aa, zero), one)
-            best = (rx - t * ax) ** 2 + (ry - t * ay) ** 2 + (rz - t * az) ** 2
-            try_t = min(max((ra + ab) / aa, zero), one)
-            d = (rx + bx - try_t * ax) ** 2 + (ry + by - try_t * ay) ** 2 + (rz + bz - try_t * az) ** 2
-            if d < best:
-                best, q, t = d, one, try_t
-            try_q = min(max(-rb / bb, zero), one)
-            d = (rx + try_q * bx) ** 2 + (ry + try_q * by) ** 2 + (rz + try_q * bz) ** 2
-            if d < best:
-                best, q, t = d, try_q, zero
-            try_q = min(max((ab - rb) / bb, zero), one)
-            d = (rx + try_q * bx - ax) ** 2 + (ry + try_q * by - ay) ** 2 + (rz + try_q * bz - az) ** 2
-            if d < best:
-                q, t = try_q, one
-        return rx + q * bx - t * ax, ry + q * by - t * ay, rz + q * bz - t * az
-
-    return jit(closest_points)
+    return jit(touch, **make_pair(contact_model, layout.n, real, jit)._asdict())

@@ -10,7 +10,6 @@ polynomials that are exact to round-off inside a stated range; outside of it a s
 from collections.abc import Callable
 from functools import lru_cache
 from math import acos, cos, exp, sin, sqrt
-from types import FunctionType
 from typing import Any, NamedTuple
 
 import numba
@@ -18,6 +17,7 @@ import numpy as np
 from llvmlite import ir
 from numba.extending import intrinsic
 
+from softgm_bench.rod.callees import with_callees
 from softgm_bench.rod.numba_layout import Layout, make_layout
 from softgm_bench.rod.series import SMALL_BEND, SMALL_EXPONENT, SMALL_TURN, TINY, bend, cosc, exponential, sinc
 
@@ -27,18 +27,22 @@ FASTMATH = {"contract", "reassoc", "nsz", "nnan", "arcp"}
 SINC, COSC, BEND, EXP = sinc(7), cosc(7), bend(11), exponential(11)
 
 
-def jit(function: Callable[..., Any], parallel: bool = False, **callees: Callable[..., Any]) -> Callable[..., Any]:
+def jit(
+    function: Callable[..., Any], parallel: bool = False, inline: bool = False, **callees: Callable[..., Any]
+) -> Callable[..., Any]:
     """Compile with the kernel's flags, keeping the machine code on disk between runs.
 
-    Numba finds cached code by a function's source and its closure. Compiled functions in a closure have no stable
-    identity, so ``callees`` are given to the function as globals instead; ``Layout.source`` in the closure stands for
-    their content.
+    ``callees`` are bound as ``callees`` says; ``Layout.source`` in the closure stands for their content. A function
+    with ``inline`` becomes part of each caller before LLVM sees it, as if it had been written there.
     """
-    namespace = {**function.__globals__, **callees}
-    bound = FunctionType(function.__code__, namespace, function.__name__, None, function.__closure__)
-    bound.__qualname__ = function.__qualname__
-    bound.__module__ = function.__module__
-    return numba.njit(fastmath=FASTMATH, error_model="numpy", cache=True, parallel=parallel)(bound)
+    compiler = numba.njit(
+        fastmath=FASTMATH,
+        error_model="numpy",
+        cache=True,
+        parallel=parallel,
+        inline="always" if inline else "never",
+    )
+    return compiler(with_callees(function, callees))
 
 
 @intrinsic
