@@ -58,7 +58,7 @@ def test_the_same_watch_finds_the_cpus_shortcuts(build):
     env = build("wall")
     with RoundTrips() as trips:
         env.step_and_maybe_reset(env.reset().set(entries.ACTION, actions(env, 1)[0]))
-    assert any("simulation.py" in found for found in trips.found)
+    assert any("sync.py" in found for found in trips.found)
 
 
 @pytest.mark.parametrize("task", TASKS)
