@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import torch
 
+from softgm_bench.envs import entries
 from softgm_bench.episodes import folder as evaluation_folder
-from softgm_bench.episodes.evaluation import EpisodeRecords
 from softgm_bench.runs import checkpoint
 from softgm_bench.storage import archive
 
@@ -57,7 +57,7 @@ def test_an_evaluation_leaves_its_episodes_and_a_summary_of_them(run, tmp_path):
     assert "success rate" in out
     assert {path.name for path in (tmp_path / "x").iterdir()} == {"episodes.csv", "summary.json"}
     found, summary = columns(tmp_path / "x/episodes.csv"), json.loads((tmp_path / "x/summary.json").read_text())
-    assert list(found) == ["episode", *EpisodeRecords.__dataclass_fields__]
+    assert list(found) == ["episode", *(column.name for column in entries.EPISODE_COLUMNS)]
     assert found["episode"] == ["0", "1", "2"]
     returns = np.array(found["undiscounted_return"], dtype=float)
     terms = sum(np.array(found[name], dtype=float) for name in found if name.startswith("reward_"))

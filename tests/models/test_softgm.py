@@ -27,7 +27,8 @@ def test_sparse_equals_dense(switches, dtype, tolerance):
     td = observation((2, 5), 4, 6, dtype=dtype)
     sparse, weights = model.forward_with_attention(td)
     dense, expected = model.forward_dense(td)
-    torch.testing.assert_close(sparse, dense, rtol=tolerance, atol=tolerance)
+    # rounding is that of the largest entries, whichever processor's instructions do the sums
+    torch.testing.assert_close(sparse, dense, rtol=tolerance, atol=tolerance * max(1.0, dense.abs().max().item()))
     assert weights.keys() == expected.keys()
     for stage in expected:
         torch.testing.assert_close(weights[stage], expected[stage], rtol=tolerance, atol=tolerance)

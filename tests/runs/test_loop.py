@@ -167,4 +167,4 @@ def test_a_fresh_process_uses_the_threads_that_it_is_told_to():
 def test_a_curriculum_is_followed_in_training_and_shown(tmp_path):
     rows = trained(tmp_path, "task=wall", "task.curriculum.enabled=true")
     assert all(float(row["difficulty"]) == 0.0 for row in rows)  # too short to be promoted
-    assert "difficulty" not in trained(tmp_path / "without", "task=wall")[0]
+    assert "difficulty" not in trained(tmp_path / "without", "task=wall", "recipe=paper")[0]
