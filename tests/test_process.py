@@ -1,0 +1,58 @@
+import os
+import subprocess
+import sys
+
+from softgm_bench import process
+
+
+def python(code, **variables):
+    environment = {name: value for name, value in os.environ.items() if name not in process.SETTINGS} | variables
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+def test_importing_the_package_sets_no_variable_and_loads_no_torch():
+    code = (
+        "import os, sys; before = dict(os.environ); import softgm_bench; "
+        "print(before == dict(os.environ), 'torch' in sys.modules)"
+    )
+    assert python(code) == "True False"
+
+
+def test_what_users_need_is_found_when_it_is_asked_for():
+    code = (
+        "import softgm_bench as s; from softgm_bench.envs import SoftArmEnv; "
+        "print(s.SoftArmEnv is SoftArmEnv, all(callable(getattr(s, n)) for n in s.__all__ if n != '__version__'), "
+        "set(s.__all__) <= set(dir(s)), s.__version__)"
+    )
+    assert python(code) == "True True True 0.1.0"
+
+
+def test_an_unknown_name_is_an_attribute_error():
+    code = "import softgm_bench\ntry: softgm_bench.nothing\nexcept AttributeError as error: print(error)"
+    assert python(code) == "module 'softgm_bench' has no attribute 'nothing'"
+
+
+def test_what_the_user_has_set_stays(monkeypatch):
+    for name in process.SETTINGS:
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("OMP_WAIT_POLICY", "passive")
+    monkeypatch.setenv("ONEDNN_MAX_CPU_ISA", "AVX2")
+    process.prepare()
+    assert "GOMP_SPINCOUNT" not in os.environ
+    assert os.environ["ONEDNN_MAX_CPU_ISA"] == "AVX2"
+    monkeypatch.delenv("OMP_WAIT_POLICY")
+    process.prepare()
+    assert os.environ["GOMP_SPINCOUNT"] == "2000"
+
+
+def test_products_stay_float32_whatever_came_before():
+    code = (
+        "import torch\n{before}\nfrom softgm_bench.runs.machine import set_threads\nset_threads(1)\n"
+        "x = torch.full((64, 64), 1.0 + 2.0**-12); print(torch.equal(x @ torch.eye(64), x))"
+    )
+    use_onednn = "torch.backends.mkldnn.matmul.fp32_precision = 'bf16'; torch.ones(64, 64) @ torch.ones(64, 64)"
+    use_onednn += "; torch.backends.mkldnn.matmul.fp32_precision = 'none'"
+    for before in ("", use_onednn):
+        assert python(code.format(before=before)) == "True"
