@@ -1,4 +1,4 @@
-"""From N control-point amplitudes to a distributed couple along the rod (Naughton et al. 2021)."""
+"""Actuation turns N control-point amplitudes into a distributed couple along the rod (Naughton et al. 2021)."""
 
 import numpy as np
 import torch
@@ -14,12 +14,12 @@ DIRECTIONS = 2  # of a section's couple: normal (d1) and binormal (d2), d_a in t
 
 
 def control_points(n_agents: int, base_length: float) -> NDArray[np.float64]:
-    """Arc lengths ``i L / (N + 1)`` of the N control points, m: ``(n_agents,)``."""
+    """Return the arc lengths ``i L / (N + 1)`` of the N control points in m, ``(n_agents,)``."""
     return base_length * np.arange(1, n_agents + 1) / (n_agents + 1)
 
 
 def torque_basis(n_agents: int, arc_length: NDArray[np.float64], base_length: float, basis: str) -> NDArray[np.float64]:
-    """Evaluate ``b_i(s)`` for every agent: ``(n_agents, len(arc_length))``, no unit.
+    """Evaluate the basis function ``b_i(s)`` of every agent, ``(n_agents, len(arc_length))``, without a unit.
 
     ``interpolating``: the cardinal cubic spline (not-a-knot) that is 1 at control point i and 0 at the other ones and
     at both ends. ``bspline``: the interior functions of a clamped uniform cubic B-spline basis, 0 at both ends.
@@ -45,7 +45,7 @@ def torque_basis(n_agents: int, arc_length: NDArray[np.float64], base_length: fl
 
 
 class Actuation:
-    """Linear map from actions to the external couple on every element, in the material frame."""
+    """This linear map takes actions to the external couple on every element in the material frame."""
 
     def __init__(
         self,
@@ -74,7 +74,7 @@ class Actuation:
         self.matrix = torch.as_tensor(max_torque * basis_values * weight, dtype=dtype, device=device)
 
     def couple(self, action: Tensor) -> Tensor:
-        """Couple on each element, N m, from actions ``(num_envs, n_agents, 2)`` (normal, binormal).
+        """Return the couple on each element in N m for actions ``(num_envs, n_agents, 2)`` (normal, binormal).
 
         Returns:
             ``(num_envs, 3, n_elements)`` in directors' components; the tangential row is zero.

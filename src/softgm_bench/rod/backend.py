@@ -1,4 +1,4 @@
-"""The rod's implementations by name: what each one is for, and building one.
+"""The registry knows the rod's implementations by name, says where each one runs, and builds them.
 
 A new backend is its module, with a class that does what ``Backend`` says, and a line in ``_REGISTRY``. The classes are
 imported when one is built; nothing else here needs torch, whose import takes seconds, or a CUDA compiler.
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class Backend(Protocol):
-    """What every implementation of the rod offers; see ``NumbaBackend.control_step`` for shapes and units."""
+    """Every implementation of the rod offers this; see ``NumbaBackend.control_step`` for shapes and units."""
 
     parameters: RodParameters
 
@@ -35,7 +35,7 @@ class Backend(Protocol):
 
 
 class _Registered(NamedTuple):
-    """One backend's declaration of itself.
+    """This is one backend's declaration of itself.
 
     Attributes:
         module: path of the module that holds its class.

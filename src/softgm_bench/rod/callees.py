@@ -1,4 +1,4 @@
-"""Binding of compiled functions to the compiled functions that call them."""
+"""Compiled functions reach the compiled functions that call them through this module."""
 
 from collections.abc import Callable, Mapping
 from types import FunctionType
@@ -6,7 +6,7 @@ from typing import Any
 
 
 def with_callees(function: Callable[..., Any], callees: Mapping[str, Callable[..., Any]]) -> Callable[..., Any]:
-    """Copy of a Python function that finds ``callees`` by name among its globals.
+    """Return a copy of a Python function that finds ``callees`` by name among its globals.
 
     Numba finds machine code on disk by a function's source and its closure, in which another compiled function has no
     stable identity; among the globals it does no harm.

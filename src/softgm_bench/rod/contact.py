@@ -1,4 +1,4 @@
-"""Contact between rods and fixed cylinders: PyElastica's penalty forces.
+"""This module computes PyElastica's penalty forces between rods and fixed cylinders.
 
 Vectors over elements keep PyElastica's layout, components before elements. A pair (cylinder, element) adds one
 dimension in front: ``(num_envs, n_cylinders, 3, n_elements)``. There are no matrix products, whose rounding depends on
@@ -18,16 +18,19 @@ _PARALLEL = 1e-6
 
 
 def element_length(position: Tensor) -> Tensor:
-    """Current lengths ``(..., n_elements)`` of nodes ``(..., 3, n_nodes)``, with PyElastica's guard of 1e-14 m."""
+    """Return the elements' current lengths ``(..., n_elements)`` in m, with PyElastica's guard of 1e-14 m.
+
+    ``position`` holds the nodes, ``(..., 3, n_nodes)``.
+    """
     return safe_norm(position[..., 1:] - position[..., :-1]) + 1e-14
 
 
 def element_radius(position: Tensor, volume: Tensor) -> Tensor:
-    """Current radii of incompressible elements (Gazzola et al. 2018, section 2.3).
+    """Return the current radii of incompressible elements in m (Gazzola et al. 2018, section 2.3).
 
     Args:
         position: ``(num_envs, 3, n_nodes)``.
-        volume: ``(n_elements,)``, conserved.
+        volume: conserved volumes of the elements, m^3, ``(n_elements,)``.
 
     Returns:
         ``(num_envs, n_elements)``.
@@ -36,7 +39,7 @@ def element_radius(position: Tensor, volume: Tensor) -> Tensor:
 
 
 def safe_norm(vector: Tensor, dim: int = -2) -> Tensor:
-    """Euclidean norm along ``dim`` whose gradient at the zero vector is zero instead of NaN."""
+    """Return the Euclidean norm along ``dim``, whose gradient at the zero vector is zero instead of NaN."""
     square = (vector * vector).sum(dim)
     positive = square > 0.0
     return torch.where(positive, torch.where(positive, square, 1.0).sqrt(), square)  # the last keeps 0 and NaN
@@ -45,7 +48,7 @@ def safe_norm(vector: Tensor, dim: int = -2) -> Tensor:
 def contact_forces(
     position: Tensor, velocity: Tensor, radius: Tensor, cylinders: Cylinders, parameters: RodParameters
 ) -> Tensor:
-    """Forces of fixed cylinders on the rods' nodes, as PyElastica's ``_calculate_contact_forces_rod_cylinder``.
+    """Return the forces of fixed cylinders on nodes, N (PyElastica's ``_calculate_contact_forces_rod_cylinder``).
 
     Its quirks are kept: an element's segment starts at the element's midpoint and has its full edge, and the first and
     last elements split their force 2/3 : 4/3 between end and inner node. Its bounding-box pruning, which misses
@@ -79,7 +82,7 @@ def contact_forces(
 
 
 def shortest_connection(start1: Tensor, edge1: Tensor, start2: Tensor, edge2: Tensor) -> Tensor:
-    """Vector from segment 1 to segment 2 at their closest points, as PyElastica's ``_find_min_dist``.
+    """Return the vector from segment 1 to segment 2 at their closest points, as PyElastica's ``_find_min_dist``.
 
     Args:
         start1: start of segment 1, ``(..., 3, n)``; all four broadcast.

@@ -1,4 +1,4 @@
-"""The GPU backend: a whole control step of every environment in one kernel launch, on torch's tensors and stream."""
+"""The GPU backend computes a control step of every environment in one kernel launch on torch's tensors and stream."""
 
 import warnings
 from typing import Any
@@ -21,7 +21,7 @@ _REAL = {torch.float64: np.float64, torch.float32: np.float32}
 
 
 class CudaBackend:
-    """Rod dynamics on NVIDIA GPUs for float64 and float32 states; equal to ``TorchBackend`` to round-off.
+    """This backend moves rods in float64 or float32 on NVIDIA GPUs and equals ``TorchBackend`` to round-off.
 
     Nothing is copied to or from the host and nothing waits for the GPU: a step is one launch on torch's current stream.
     """

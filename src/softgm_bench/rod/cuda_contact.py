@@ -1,4 +1,4 @@
-"""Rod-cylinder contact of the CUDA kernel: each thread looks after its own element.
+"""In the CUDA kernel's rod-cylinder contact, each thread looks after its own element.
 
 Now and then it measures the distance to every cylinder's axis and keeps two things: a bit set of the cylinders that are
 near, and how far all others are. Until its midpoint has travelled that far no other cylinder can touch, so that in free
@@ -35,7 +35,7 @@ else:
 
 @lru_cache
 def make_press(n_elements: int, real: type, contact_model: str) -> Callable[..., Any]:
-    """Device function for an element's contact with all cylinders of its rod."""
+    """Make the device function for an element's contact with all cylinders of its rod."""
     zero, safety, half = real(0.0), real(SAFETY), real(0.5)
     screen = _make_screen(real)
     touch = _make_touch(n_elements, real, contact_model)
@@ -92,7 +92,7 @@ def make_press(n_elements: int, real: type, contact_model: str) -> Callable[...,
 
 @lru_cache
 def make_no_press(real: type) -> Callable[..., Any]:
-    """The same where there are no cylinders."""
+    """Make the device function that stands in for that of ``make_press`` where there are no cylinders."""
     zero = real(0.0)
 
     def press(

@@ -1,4 +1,4 @@
-"""One substep's arithmetic for one element or node of a rod: device functions of the CUDA kernel.
+"""The CUDA kernel's device functions do one substep's arithmetic for one element or node of a rod.
 
 The formulae are those of ``torch_backend`` (Gazzola et al. 2018; PyElastica 1.0.0's arithmetic). Everything is scalar:
 a thread holds one node and one element in registers. Transcendental functions are polynomials inside a stated range, as
@@ -28,7 +28,7 @@ _EXP_TERMS: dict[type, int] = {np.float64: 11, np.float32: 7}
 
 
 class Coefficients(NamedTuple):
-    """A uniform rod's constants in the kernel's precision; SI units."""
+    """These are a uniform rod's constants in the kernel's precision, in SI units."""
 
     dt: Any
     half_dt: Any
@@ -107,7 +107,7 @@ def coefficients(parameters: RodParameters, real: type) -> Coefficients:
 
 
 class Physics(NamedTuple):
-    """Device functions of one precision."""
+    """These are the device functions of one precision."""
 
     turn: Callable[..., Any]
     strain: Callable[..., Any]
@@ -128,7 +128,7 @@ def device(function: Callable[..., Any], inline: bool = False, **callees: Callab
 
 @lru_cache
 def make_physics(real: type) -> Physics:
-    """Device functions in float64 or float32."""
+    """Make the device functions in float64 or float32."""
     return Physics(
         turn=_make_turn(real),
         strain=_make_strain(real),
@@ -314,7 +314,7 @@ def _make_straighten(real: type) -> Callable[..., Any]:
 
 
 def horner(real: type, series: Sequence[float]) -> Callable[..., Any]:
-    """Device function that evaluates a polynomial, constant first; unrolled at compile time."""
+    """Make a device function that evaluates a polynomial, constant first, unrolled at compile time."""
     constant = real(series[0])
     if len(series) == 1:
         return device(lambda x: constant)

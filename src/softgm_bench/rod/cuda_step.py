@@ -1,4 +1,6 @@
-"""The CUDA kernel: one launch advances every rod by a control step, a block for a rod, a thread for a node and element.
+"""One launch of the CUDA kernel advances every rod by a control step.
+
+A rod has a block of threads, a node and the element behind it have a thread.
 
 A rod stays in registers for all substeps. Neighbours meet in shared memory twice a substep: nodes and directors go to
 the left neighbour, then internal forces, curvatures and lengths to both. Between two writes of the same entries lies a
@@ -90,16 +92,16 @@ def make_step(n_elements: int, real: type, contact: str | None) -> Callable[...,
 
 
 def scratch_columns(n_elements: int, real: type) -> int:
-    """Columns that a rod needs of a scratch array ``(num_envs, 22, columns)``, where neighbours meet instead.
+    """Return the number of columns of the scratch array ``(num_envs, 22, columns)`` in which neighbours meet.
 
-    0 if the rod fits into a block's shared memory.
+    It is 0 if the rod fits into a block's shared memory.
     """
     fits = ROWS * (n_elements + 2) * np.dtype(real).itemsize <= _SHARED_BYTES
     return 0 if fits else n_elements + 2
 
 
 def most_registers(n_elements: int, real: type) -> int:
-    """Registers of a thread with which a block can be launched, and several of them beside each other.
+    """Return the most registers of a thread with which several blocks can run beside each other.
 
     Registers are allotted to whole warps of 32 threads, in multiples of 8.
     """

@@ -1,4 +1,4 @@
-"""Contact as a force per unit of rest arc length, integrated over each element: ``contact_model="exact"``.
+"""``contact_model="exact"`` integrates a contact force per unit of rest arc length over each element.
 
 At arc length s the rod is a point x(s) on its centreline, linear between nodes and without PyElastica's half-element
 shift. It feels ``f = kappa * penetration - nu * v_n`` along the normal from the closest point of the cylinder's axis
@@ -32,7 +32,7 @@ GAUSS_NODES = GAUSS_NODES + 0.5
 def exact_contact_forces(
     position: Tensor, velocity: Tensor, radius: Tensor, cylinders: Cylinders, parameters: RodParameters
 ) -> Tensor:
-    """Forces of fixed cylinders on the rods' nodes: the integral of the density above over each element's contact.
+    """Return the forces of fixed cylinders on the rods' nodes in N, integrals of the density above over the contact.
 
     The interval of contact is found in closed form, so the quadrature sees a smooth function except where the element
     passes from the side of a cylinder to its round end. Each point's force goes to the element's two nodes by the lever
@@ -77,7 +77,7 @@ def exact_contact_forces(
 
 
 def contact_interval(start: Tensor, edge: Tensor, axis: Tensor, length: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
-    """Where on an element its centreline is inside of a capsule, in closed form.
+    """Return the interval of an element in which its centreline is inside of a capsule, in closed form.
 
     A capsule is convex and the union of a cylinder's side and two balls: the interval runs from the first entry into
     any of them to the last exit.

@@ -1,7 +1,7 @@
 # Compiled callees reach a function as globals (see jit), out of the linters' sight.
 # ruff: noqa: F821
 # mypy: disable-error-code="name-defined"
-"""The fused CPU backend: a whole control step of every environment in one compiled call, parallel over environments."""
+"""The fused CPU backend computes a control step of every environment in one compiled, parallel call."""
 
 from collections.abc import Callable
 from functools import lru_cache
@@ -22,7 +22,7 @@ from softgm_bench.rod.state import Cylinders, RodState, check_inputs
 
 
 class NumbaBackend:
-    """Rod dynamics on the CPU for float64 and float32 states; equal to ``TorchBackend`` to round-off."""
+    """This backend moves rods in float64 or float32 on the CPU and equals ``TorchBackend`` to round-off."""
 
     def __init__(self, parameters: RodParameters) -> None:
         """Prepare for one arm; compilation happens at the first step of each precision and is cached on disk."""

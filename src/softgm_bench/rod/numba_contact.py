@@ -1,7 +1,7 @@
 # Compiled callees reach a function as globals (see jit), out of the linters' sight.
 # ruff: noqa: F821
 # mypy: disable-error-code="name-defined"
-"""Rod-cylinder contact of the Numba kernel: PyElastica's ``RodCylinderContact`` without its pruning.
+"""The Numba kernel's rod-cylinder contact is PyElastica's ``RodCylinderContact`` without its pruning.
 
 A cylinder is looked at only when it might touch. When it is, the distance from its axis to the nearest element is
 stored; until the rod can have travelled that far, the cylinder costs nothing, and all of them together one comparison
@@ -26,14 +26,14 @@ NEXT_CHECK, COLUMNS = 7, 8
 
 
 class Contact(NamedTuple):
-    """Compiled functions on one rod's buffer and its cylinders."""
+    """These are compiled functions on one rod's buffer and its cylinders."""
 
     reach: Callable[..., Any]
     add_contact: Callable[..., Any]
 
 
 def make_contact(layout: Layout, real: type, touch: Callable[..., Any]) -> Contact:
-    """Compile for one layout and one precision; ``touch`` is the force of one cylinder on one element."""
+    """Compile contact for one layout and one precision; ``touch`` adds the force of one cylinder on one element."""
     p, n = layout, layout.n
     never = real(np.inf)
 

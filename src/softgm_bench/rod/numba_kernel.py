@@ -1,7 +1,7 @@
 # Compiled callees reach a function as globals (see jit), out of the linters' sight.
 # ruff: noqa: F821
 # mypy: disable-error-code="name-defined"
-"""One substep of one rod as vectorisable loops over elements (Gazzola et al. 2018; PyElastica 1.0.0's arithmetic).
+"""Vectorisable loops over elements make one substep of one rod (Gazzola et al. 2018; PyElastica's arithmetic).
 
 Loops work in place on the flat buffer described in ``numba_layout``. Transcendental functions are replaced by
 polynomials that are exact to round-off inside a stated range; outside of it a scalar loop calls the functions.
@@ -47,7 +47,7 @@ def jit(
 
 @intrinsic
 def larger(typing_context, a, b):
-    """The larger of two numbers of one type, in a form that LLVM vectorises as a reduction (Python's ``max`` isn't)."""
+    """Return the larger of two numbers of one type in a form that LLVM vectorises as a reduction, unlike ``max``."""
 
     def generate(context, builder, signature, arguments):
         real = arguments[0].type
@@ -58,7 +58,7 @@ def larger(typing_context, a, b):
 
 
 def rounded(coefficients: tuple[float, ...], largest: float, real: type) -> tuple[Any, ...]:
-    """Coefficients of a polynomial in one precision, zero where their term is below round-off.
+    """Return a polynomial's coefficients in one precision, zero where their term is below round-off.
 
     Multiplying by a constant zero costs nothing: the compiler drops it.
     """
@@ -67,7 +67,7 @@ def rounded(coefficients: tuple[float, ...], largest: float, real: type) -> tupl
 
 
 class Kernel(NamedTuple):
-    """Compiled functions on one rod's buffer."""
+    """These are compiled functions on one rod's buffer."""
 
     stresses: Callable[..., Any]
     couples: Callable[..., Any]

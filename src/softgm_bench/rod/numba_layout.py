@@ -1,4 +1,4 @@
-"""Where each quantity of one rod lies in the flat scratch buffer of the Numba kernel.
+"""The layout says where each quantity of one rod lies in the flat scratch buffer of the Numba kernel.
 
 All arrays of a rod share one buffer with compile-time offsets: LLVM then proves that they do not overlap and vectorises
 the loops over elements without run-time checks. Everything a substep touches (about 30 kB in float64) stays in the L1
@@ -20,7 +20,7 @@ Array = NDArray[np.floating]
 
 
 class Layout(NamedTuple):
-    """Offsets of the first entry of each row; index -1 and index n of every row exist and may hold padding zeros."""
+    """Each field is the offset of a row's first entry; a row's indices -1 and n exist and may hold padding zeros."""
 
     source: int  # digest of the kernel's source, so that machine code cached on disk never outlives it
     n: int  # elements
@@ -110,7 +110,7 @@ def make_layout(n_elements: int, dtype: type) -> Layout:
 
 
 def constant_rows(parameters: RodParameters, layout: Layout, dtype: np.dtype) -> Array:
-    """The buffer with only the rod's constants filled in: ``(layout.size,)``."""
+    """Return the buffer ``(layout.size,)`` with only the rod's constants (SI units) filled in."""
     constants = rod_constants(parameters)
     dt = parameters.dt
     rate = constants.rotational_decay_rate

@@ -1,4 +1,4 @@
-"""The arm's physical parameters and the constants of the discretised rod derived from them."""
+"""This module holds the arm's physical parameters and derives the constants of the discretised rod from them."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 
 
 class ContactCoefficients(NamedTuple):
-    """What the fused kernels multiply with; in this order they are the Numba kernel's table."""
+    """The fused kernels multiply with these; in this order they are the Numba kernel's table."""
 
     stiffness: float
     damping: float
@@ -23,7 +23,7 @@ class ContactCoefficients(NamedTuple):
 
 @dataclass(frozen=True)
 class RodParameters:
-    """One uniform Cosserat rod with a clamped base, in SI units. The defaults are the paper's arm.
+    """These parameters describe one uniform Cosserat rod with a clamped base in SI units, by default the paper's arm.
 
     ``damping_protocol`` names the form of PyElastica's ``AnalyticalLinearDamper`` that receives ``damping_constant``.
     One control step is ``substeps`` position-Verlet steps of ``dt`` seconds.
@@ -94,12 +94,12 @@ class RodParameters:
 
     @property
     def n_nodes(self) -> int:
-        """Number of nodes, one more than elements."""
+        """Return the number of nodes, one more than elements."""
         return self.n_elements + 1
 
     @property
     def contact_coefficients(self) -> ContactCoefficients:
-        """Of the contact model: per element in ``pyelastica``, densities along the rod in ``exact``."""
+        """Return the contact model's coefficients, SI units: per element in ``pyelastica``, per metre in ``exact``."""
         per = self.contact_length if self.contact_model == "exact" else 1.0
         return ContactCoefficients(
             stiffness=self.contact_stiffness / per,
@@ -110,12 +110,12 @@ class RodParameters:
 
     @property
     def control_dt(self) -> float:
-        """Duration of one control step in seconds."""
+        """Return the duration of one control step in s."""
         return self.dt * self.substeps
 
 
 class RodConstants(NamedTuple):
-    """Constants of the discretised rod, float64. Matrices that are diagonal are kept as their diagonals.
+    """These are the constants of the discretised rod in float64; diagonal matrices are kept as their diagonals.
 
     Attributes:
         position: nodes at rest, ``(3, n_nodes)``.

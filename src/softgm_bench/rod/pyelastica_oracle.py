@@ -1,4 +1,4 @@
-"""PyElastica 1.0.0 itself, driven as our backends are: the oracle of a rod's trajectory. An optional extra."""
+"""PyElastica 1.0.0 itself, an optional extra, is the oracle of a rod's trajectory and is driven as our backends are."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -18,7 +18,7 @@ UP = (0.0, 0.0, 1.0)
 
 
 class Post(NamedTuple):
-    """One fixed cylinder: the centre of one end, the unit vector to the other end, length and radius, m."""
+    """A post is one fixed cylinder: the centre of one end, the unit vector to the other, length and radius, in m."""
 
     start: tuple[float, float, float]
     axis: tuple[float, float, float]
@@ -27,7 +27,7 @@ class Post(NamedTuple):
 
 
 class History(NamedTuple):
-    """One entry per control step, taken at its end.
+    """A history has one entry per control step, taken at its end.
 
     Attributes:
         position: m, ``(steps, 3, n_nodes)``.
@@ -51,10 +51,10 @@ class _Simulator(ea.BaseSystemCollection, ea.Constraints, ea.Forcing, ea.Damping
 
 
 class Loads:
-    """Couple ``(3, n_elements)`` and force ``(3, n_nodes)`` of the current control step, changed in place."""
+    """These loads act in the current control step: couple ``(3, n_elements)`` in N m, force ``(3, n_nodes)`` in N."""
 
     def __init__(self, couple: Array, force: Array | None = None) -> None:
-        """Begin with these; without a force there never is one."""
+        """Begin with this couple and this force; without a force there never is one."""
         self.couple, self.force = couple, force
 
 
@@ -125,7 +125,7 @@ def _watched_pruning(apply: bool) -> Iterator[_Pruning]:
 
 
 def straight_rod(parameters: RodParameters) -> ea.CosseratRod:
-    """The arm at rest, as ``straight_rods`` has it."""
+    """Build the arm at rest, as ``straight_rods`` has it."""
     return ea.CosseratRod.straight_rod(
         parameters.n_elements,
         np.zeros(3),
@@ -142,7 +142,7 @@ def straight_rod(parameters: RodParameters) -> ea.CosseratRod:
 def build(
     parameters: RodParameters, loads: Loads, posts: Sequence[Post] = (), rods: int = 1
 ) -> tuple[_Simulator, ea.CosseratRod]:
-    """A simulator that still has to be finalised, and its first arm: clamps, dampers, loads and contacts, no more.
+    """Build a simulator with clamps, dampers, loads and contacts, still to be finalised, and return its first arm too.
 
     Several ``rods`` stand in the same place under the same loads, touch the same posts and don't see each other.
     """
@@ -220,7 +220,7 @@ def _add_fixed_cylinder(
 
 
 def as_cylinders(per_environment: Sequence[Sequence[Post]], dtype: torch.dtype = torch.float64) -> Cylinders:
-    """For our backends: one list of posts an environment, padded with masked cylinders to the longest."""
+    """Make our backends' cylinders of each environment's posts, padded with masked ones to the longest list."""
     size = max(map(len, per_environment))
     filler = Post((0.0, 0.0, 0.0), UP, 1.0, 1.0)  # as wide as the arm is long: an unread mask would show
     padded = [[*posts, *[filler] * (size - len(posts))] for posts in per_environment]

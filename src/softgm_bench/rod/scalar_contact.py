@@ -1,7 +1,7 @@
 # Compiled callees reach a function as globals (see callees), out of the linters' sight.
 # ruff: noqa: F821
 # mypy: disable-error-code="name-defined"
-"""Force between one element and one cylinder in scalar arithmetic, written once for the Numba and the CUDA kernel.
+"""The force between one element and one cylinder is written here once, for the Numba and for the CUDA kernel.
 
 Every ``make_*`` binds its constants in one precision, because one Python float would promote float32 arithmetic, and
 compiles with what it is given: ``numba_kernel.jit`` or ``cuda_kernel.device``. ``contact`` (PyElastica's forces) and
@@ -32,17 +32,17 @@ Compiler = Callable[..., Compiled]  # of a function and, by name, the compiled f
 
 
 def smaller(a, b):
-    """The smaller of two numbers."""
+    """Return the smaller of two numbers."""
     return b if b < a else a
 
 
 def larger(a, b):
-    """The larger of two numbers."""
+    """Return the larger of two numbers."""
     return b if b > a else a
 
 
 def clip(value, low, high):
-    """``value`` within its bounds; NaN remains NaN."""
+    """Return the value within the range from ``low`` to ``high``; NaN remains NaN."""
     value = low if low > value else value
     return high if high < value else value
 
@@ -53,7 +53,7 @@ def _compiled(function: Compiled, compiler: Compiler) -> Compiled:
 
 
 class Pair(NamedTuple):
-    """Compiled functions on one element and one cylinder; scalars in SI units throughout.
+    """These are compiled functions on one element and one cylinder; scalars are in SI units.
 
     ``meet`` takes the positions ``x, y, z`` and ``nx, ny, nz`` of the element's first and second node, the element's
     radius, and ``cylinder``, whose entries are the start and the edge of its axis (three each) and its radius. It
@@ -279,7 +279,7 @@ def _make_interval(real: type, compiler: Compiler) -> Compiled:
     parallel, perpendicular = real(float(eps) ** 1.5), eps * eps
 
     def interval(x, y, z, ex, ey, ez, ax, ay, az, length, reach2):
-        """Where on the element its centreline is inside of the capsule; ``exact_contact.contact_interval``."""
+        """Interval of the element in which its centreline is in the capsule; ``exact_contact.contact_interval``."""
         along = x * ax + y * ay + z * az
         rate = ex * ax + ey * ay + ez * az
         square = ex * ex + ey * ey + ez * ez

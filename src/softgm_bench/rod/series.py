@@ -1,6 +1,7 @@
-"""Polynomials that stand for transcendental functions in the fused kernels, and the ranges in which they do.
+"""Polynomials stand for transcendental functions in the fused kernels, within the ranges given here.
 
-Constant first. With the number of terms that ``numba_kernel`` uses, each is exact to float64's round-off in its range.
+Their coefficients begin with the constant. With the number of terms that ``numba_kernel`` uses, each is exact to
+float64's round-off in its range.
 """
 
 from math import factorial
@@ -15,17 +16,17 @@ SMALL_EXPONENT = 0.2  # |exponent| up to which ``exponential`` holds
 
 
 def sinc(terms: int) -> tuple[float, ...]:
-    """``sin(x) / x`` as a polynomial of ``x^2``."""
+    """Return the coefficients of ``sin(x) / x`` as a polynomial of ``x^2``."""
     return tuple((-1.0) ** k / factorial(2 * k + 1) for k in range(terms))
 
 
 def cosc(terms: int) -> tuple[float, ...]:
-    """``(1 - cos(x)) / x^2`` as a polynomial of ``x^2``."""
+    """Return the coefficients of ``(1 - cos(x)) / x^2`` as a polynomial of ``x^2``."""
     return tuple((-1.0) ** k / factorial(2 * k + 2) for k in range(terms))
 
 
 def bend(degree: int) -> tuple[float, ...]:
-    """``theta / sin(theta)`` as a polynomial of ``sin^2(theta / 2)``, of ``degree + 1``; exactly 1 at 0."""
+    """Return ``theta / sin(theta)`` as a polynomial of ``sin^2(theta / 2)`` of ``degree + 1``, exactly 1 at 0."""
     tail = Chebyshev.interpolate(
         lambda x: (np.arcsin(np.sqrt(x)) / np.sqrt(x * (1.0 - x)) - 1.0) / x, degree, domain=[0.0, SMALL_BEND]
     )
@@ -33,5 +34,5 @@ def bend(degree: int) -> tuple[float, ...]:
 
 
 def exponential(terms: int) -> tuple[float, ...]:
-    """``exp(x)``."""
+    """Return the coefficients of ``exp(x)`` as a polynomial of ``x``."""
     return tuple(1.0 / factorial(k) for k in range(terms))

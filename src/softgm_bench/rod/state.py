@@ -1,4 +1,4 @@
-"""What moves (the rod's state) and what it may touch (cylinders), batched over environments."""
+"""The rods' state and the cylinders that they may touch are batched over environments."""
 
 from functools import lru_cache
 
@@ -10,7 +10,7 @@ from softgm_bench.rod.parameters import RodParameters, rod_constants
 
 
 class RodState(TensorClass):
-    """Kinematic state of ``num_envs`` rods; ``batch_size`` is ``(num_envs,)``.
+    """This is the kinematic state of ``num_envs`` rods; ``batch_size`` is ``(num_envs,)``.
 
     Attributes:
         position: nodes in the world frame, m, ``(num_envs, 3, n_nodes)``.
@@ -26,7 +26,7 @@ class RodState(TensorClass):
 
 
 class Cylinders(TensorClass):
-    """Fixed rigid cylinders, padded to a common number per environment; ``batch_size`` is ``(num_envs,)``.
+    """These are fixed rigid cylinders, padded to one number per environment; ``batch_size`` is ``(num_envs,)``.
 
     Attributes:
         start: centre of one end, m, ``(num_envs, n_cylinders, 3)``.
@@ -49,7 +49,7 @@ def straight_rods(
     dtype: torch.dtype = torch.float64,
     device: torch.device | str = "cpu",
 ) -> RodState:
-    """Rods at rest: straight along +z from the origin with d1 = +y."""
+    """Return ``num_envs`` rods at rest, straight along +z from the origin with d1 = +y."""
     position, director = (
         one.expand(num_envs, *one.shape).clone() for one in _straight(parameters, dtype, torch.device(device))
     )
@@ -71,7 +71,10 @@ def _straight(parameters: RodParameters, dtype: torch.dtype, device: torch.devic
 
 
 def dilatation(position: Tensor, rest_length: Tensor) -> Tensor:
-    """Element lengths over rest lengths (Gazzola et al. 2018, eq. 3.3): ``(num_envs, n_elements)``."""
+    """Return element lengths over rest lengths, ``(num_envs, n_elements)`` (Gazzola et al. 2018, eq. 3.3).
+
+    ``position`` holds the nodes in m, ``(num_envs, 3, n_nodes)``; ``rest_length`` broadcasts with the result.
+    """
     edges = position[..., 1:] - position[..., :-1]
     return edges.norm(dim=-2) / rest_length
 
@@ -84,7 +87,7 @@ def check_inputs(
     cylinders: Cylinders | None,
     active: Tensor | None,
 ) -> None:
-    """Refuse what does not fit together before any kernel reads it.
+    """Refuse arguments that do not fit together before any kernel reads them.
 
     Raises:
         ValueError: naming the first argument whose shape is wrong, and the right one.

@@ -1,4 +1,4 @@
-"""Differentiable reference of the rod's motion: PyElastica 1.0.0's equations in batched PyTorch.
+"""The differentiable reference of the rod's motion is PyElastica 1.0.0's equations in batched PyTorch.
 
 Every function takes tensors whose first dimension is the environment and whose last is the node, element or Voronoi
 region. There are no matrix products, whose rounding depends on the batch: on the CPU, no bit of an environment depends
@@ -31,7 +31,7 @@ _ANGLE_OVER_SINE = tuple(4.0**n * math.factorial(n) ** 2 / math.factorial(2 * n 
 
 
 class Motion(NamedTuple):
-    """The fields of ``RodState`` as plain tensors, with the same shapes."""
+    """These are the fields of ``RodState`` as plain tensors with the same shapes."""
 
     position: Tensor
     director: Tensor
@@ -40,7 +40,7 @@ class Motion(NamedTuple):
 
 
 class Geometry(NamedTuple):
-    """What follows from node positions (Gazzola et al. 2018, eqs 3.3 and 3.4).
+    """These quantities follow from node positions (Gazzola et al. 2018, eqs 3.3 and 3.4).
 
     Attributes:
         tangent: ``(num_envs, 3, n_elements)``.
@@ -54,7 +54,9 @@ class Geometry(NamedTuple):
 
 
 class TorchBackend:
-    """Moves rods by position Verlet with a clamped base, analytical damping and contact; device and dtype of the state.
+    """This backend moves rods by position Verlet with a clamped base, analytical damping and contact.
+
+    It computes on the state's device and in its dtype.
 
     Attributes:
         parameters: of every rod.
@@ -240,7 +242,7 @@ def kinematic_step(motion: Motion, duration: float) -> Motion:
 
 
 def straightened(director: Tensor) -> Tensor:
-    """Directors orthonormal to round-off again: one Newton step ``(3 - Q Q^T) Q / 2`` towards the nearest rotation.
+    """Return directors made orthonormal again by one Newton step ``(3 - Q Q^T) Q / 2`` towards the nearest rotation.
 
     PyElastica leaves directors to themselves. In float64 they stay within 1e-13; in float32 what they lose in each of
     thousands of steps adds up, and the arm drifts with it.
@@ -287,7 +289,7 @@ def constrain_rates(motion: Motion) -> Motion:
 
 
 def dampen(motion: Motion, dilatation: Tensor, constants: SimpleNamespace) -> Motion:
-    """Exact decay of the rates over one step (``AnalyticalLinearDamper.dampen_rates``, both protocols)."""
+    """Let the rates decay exactly over one step (``AnalyticalLinearDamper.dampen_rates``, both protocols)."""
     rate = constants.rotational_decay_rate
     exponent = rate * dilatation[:, None] if constants.decay_follows_dilatation else rate
     return motion._replace(
@@ -296,7 +298,7 @@ def dampen(motion: Motion, dilatation: Tensor, constants: SimpleNamespace) -> Mo
 
 
 def geometry(position: Tensor, constants: SimpleNamespace) -> Geometry:
-    """Tangents and dilatations from nodes ``(num_envs, 3, n_nodes)`` (``_compute_all_dilatations``)."""
+    """Return tangents and dilatations of nodes ``(num_envs, 3, n_nodes)`` (``_compute_all_dilatations``)."""
     length = element_length(position)
     voronoi_length = 0.5 * (length[:, 1:] + length[:, :-1])
     return Geometry(
@@ -307,7 +309,7 @@ def geometry(position: Tensor, constants: SimpleNamespace) -> Geometry:
 
 
 def internal_stress(director: Tensor, now: Geometry, constants: SimpleNamespace) -> Tensor:
-    """Shear/stretch stress n_L = S sigma with sigma = e Q t - (0, 0, 1) (``_compute_shear_stretch_strains``).
+    """Return the stress n_L = S sigma with sigma = e Q t - (0, 0, 1) (``_compute_shear_stretch_strains``).
 
     Returns:
         In the material frame, ``(num_envs, 3, n_elements)``.
@@ -318,12 +320,12 @@ def internal_stress(director: Tensor, now: Geometry, constants: SimpleNamespace)
 
 
 def internal_forces(director: Tensor, stress: Tensor, now: Geometry) -> Tensor:
-    """Differences of Q^T n_L / e over nodes (eq. 3.8; ``_compute_internal_forces``): ``(num_envs, 3, n_nodes)``."""
+    """Return differences of Q^T n_L / e, N, ``(num_envs, 3, n_nodes)`` (eq. 3.8; ``_compute_internal_forces``)."""
     return difference(to_world(director, stress) / now.dilatation[:, None])
 
 
 def internal_torques(motion: Motion, stress: Tensor, now: Geometry, constants: SimpleNamespace) -> Tensor:
-    """Couples on the elements (eq. 3.9; ``_compute_internal_torques``).
+    """Return the couples on the elements in N m (eq. 3.9; ``_compute_internal_torques``).
 
     Returns:
         In the material frame, ``(num_envs, 3, n_elements)``.
@@ -344,7 +346,7 @@ def internal_torques(motion: Motion, stress: Tensor, now: Geometry, constants: S
 
 
 def curvature(director: Tensor, constants: SimpleNamespace) -> Tensor:
-    """Bend/twist strain kappa, the rotation vector between neighbours over the Voronoi length (``_inv_rotate``).
+    """Return the strain kappa, the rotation vector between neighbours over the Voronoi length (``_inv_rotate``).
 
     Args:
         director: Q, ``(num_envs, 3, 3, n_elements)``.
@@ -363,7 +365,7 @@ def curvature(director: Tensor, constants: SimpleNamespace) -> Tensor:
 
 
 def sine_and_cosine_terms(square: Tensor) -> tuple[Tensor, Tensor]:
-    """``sin(x) / x`` and ``(1 - cos(x)) / x^2`` as functions of ``x^2``, smooth at 0."""
+    """Return ``sin(x) / x`` and ``(1 - cos(x)) / x^2`` as functions of ``x^2``, smooth at 0."""
     near = square < _SERIES_BELOW
     series = torch.where(near, square, 0.0)
     far = torch.where(near, 1.0, square)
@@ -375,7 +377,7 @@ def sine_and_cosine_terms(square: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def angle_over_sine(half_versine: Tensor) -> Tensor:
-    """``theta / sin(theta)`` as a function of ``w = (1 - cos(theta)) / 2``, smooth at 0.
+    """Return ``theta / sin(theta)`` as a function of ``w = (1 - cos(theta)) / 2``, smooth at 0.
 
     PyElastica's ``arccos`` has no derivative at theta = 0; this function's is 2/3. It is finite at theta = pi.
     """
@@ -387,23 +389,26 @@ def angle_over_sine(half_versine: Tensor) -> Tensor:
 
 
 def to_material(director: Tensor, vector: Tensor) -> Tensor:
-    """Q v for each element: ``(num_envs, 3, 3, n_elements)`` and ``(num_envs, 3, n_elements)``."""
+    """Return Q v for each element: ``(num_envs, 3, 3, n_elements)`` times ``(num_envs, 3, n_elements)``."""
     return (director * vector[:, None]).sum(2)
 
 
 def to_world(director: Tensor, vector: Tensor) -> Tensor:
-    """Q^T v for each element: ``(num_envs, 3, 3, n_elements)`` and ``(num_envs, 3, n_elements)``."""
+    """Return Q^T v for each element: ``(num_envs, 3, 3, n_elements)`` times ``(num_envs, 3, n_elements)``."""
     return (director * vector[:, :, None]).sum(1)
 
 
 def difference(values: Tensor) -> Tensor:
-    """Difference of neighbours, zeros beyond the ends, ``(..., n)`` to ``(..., n + 1)`` (``_two_point_difference``)."""
+    """Return neighbours' differences, zeros beyond the ends: ``(..., n)`` becomes ``(..., n + 1)``.
+
+    PyElastica: ``_two_point_difference``.
+    """
     zero = torch.zeros_like(values[..., :1])
     return torch.cat([values, zero], dim=-1) - torch.cat([zero, values], dim=-1)
 
 
 def quadrature(values: Tensor) -> Tensor:
-    """Mean of neighbours, zeros beyond the ends, ``(..., n)`` to ``(..., n + 1)`` (``_trapezoidal``)."""
+    """Return neighbours' means, zeros beyond the ends, ``(..., n)`` to ``(..., n + 1)`` (``_trapezoidal``)."""
     zero = torch.zeros_like(values[..., :1])
     return 0.5 * (torch.cat([values, zero], dim=-1) + torch.cat([zero, values], dim=-1))
 
