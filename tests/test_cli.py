@@ -35,7 +35,7 @@ def run(folder, *arguments):
 
 
 # Each process takes seconds to start, so mistakes that are told apart here are those that take different ways out:
-# Hydra's composition, the dataclasses, the semantic checks, the file system. The rest is in experiment/test_config.py.
+# Hydra's composition, the dataclasses, the semantic checks, the file system. The rest is in tests/config.
 MISTAKES = {
     "unknown task": (["task=wal"], "task=wal: no such task; choose one of basic, structured, vmas_balance"),
     "misspelt key": (["experiment.num_env=4"], "experiment.num_env: no such key; did you mean experiment.num_envs?"),

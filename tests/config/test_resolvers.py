@@ -1,7 +1,9 @@
 """Values that depend on what was chosen elsewhere."""
 
+import pytest
 from omegaconf import OmegaConf
 
+from softgm_bench.algorithms import algorithm_configs
 from softgm_bench.config import compose_untyped, resolvers
 
 resolvers.register()
@@ -42,3 +44,12 @@ def test_the_first_value_that_is_not_null():
 def test_the_command_line_replaces_the_choice():
     assert compose_untyped(["algo.gamma=0.5", "recipe=paper"]).algo.gamma == 0.5
     assert compose_untyped(["algo.critic.mlp=null"]).algo.critic.mlp is None
+
+
+@pytest.mark.parametrize("algo", algorithm_configs())
+def test_all_settings_can_be_printed_as_values(algo):
+    """``--cfg job --resolve`` resolves in place, which OmegaConf does only with containers of its own."""
+    composed = compose_untyped([f"algo={algo}", "task=wall"])
+    values = OmegaConf.to_container(composed, resolve=True)
+    OmegaConf.resolve(composed)
+    assert OmegaConf.to_container(composed) == values

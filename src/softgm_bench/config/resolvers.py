@@ -16,27 +16,32 @@ SMOKE = "smoke"
 
 def tuned_or_paper(tuned: Any, paper: Any, *, _root_: DictConfig) -> Any:
     """The first value with ``recipe=tuned``, the second with ``recipe=paper``."""
-    return paper if OmegaConf.select(_root_, "recipe") == PAPER else tuned
+    return _node(paper if OmegaConf.select(_root_, "recipe") == PAPER else tuned)
 
 
 def on_or_off_policy(on: Any, off: Any, *, _root_: DictConfig) -> Any:
     """The second value for algorithms that learn from a replay (``algo.replay_capacity``), the first for the others."""
-    return on if OmegaConf.select(_root_, "algo.replay_capacity") is None else off
+    return _node(on if OmegaConf.select(_root_, "algo.replay_capacity") is None else off)
 
 
 def in_smoke(smoke: Any, otherwise: Any, *, _root_: DictConfig) -> Any:
     """The first value with ``experiment=smoke``, the second with every other experiment."""
-    return smoke if OmegaConf.select(_root_, "experiment.name") == SMOKE else otherwise
+    return _node(smoke if OmegaConf.select(_root_, "experiment.name") == SMOKE else otherwise)
 
 
 def first(*values: Any) -> Any:
     """The first value that is not null; null if all are."""
-    return next((value for value in values if value is not None), None)
+    return _node(next((value for value in values if value is not None), None))
 
 
 def label(*, _root_: DictConfig) -> str:
     """What results are named after, ``Config.label``; for run folders."""
     return labelled(_root_.algo.name, _root_.model.name, _root_.observation, _root_.perturbation.name)
+
+
+def _node(value: Any) -> Any:
+    """A list or a group as OmegaConf's own: it would resolve others (``--cfg job --resolve``) as if they were scalars."""
+    return OmegaConf.create(value) if isinstance(value, dict | list) else value
 
 
 def register() -> None:
