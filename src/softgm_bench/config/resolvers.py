@@ -40,7 +40,7 @@ def label(*, _root_: DictConfig) -> str:
 
 
 def _node(value: Any) -> Any:
-    """A list or a group as OmegaConf's own: it would resolve others (``--cfg job --resolve``) as if they were scalars."""
+    """Give a list or a group as OmegaConf's own, which it can resolve in place (``--cfg job --resolve``)."""
     return OmegaConf.create(value) if isinstance(value, dict | list) else value
 
 
