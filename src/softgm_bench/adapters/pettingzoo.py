@@ -168,7 +168,7 @@ class SoftArmParallelEnv(ParallelEnv[str, Observation, Array]):
         self._td: TensorDictBase | None = None
 
     def observation_space(self, agent: str) -> spaces.Space:
-        """Of one agent; the same object each time, so that it can be seeded."""
+        """Give one agent's space; the same object each time, so that it can be seeded."""
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> spaces.Box:

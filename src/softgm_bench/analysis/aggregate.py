@@ -35,7 +35,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Aggregate:
-    """Of an algorithm over all of the paper's tasks; estimates are None where ``missing`` names tasks."""
+    """An algorithm's aggregates over all of the paper's tasks; estimates are None where ``missing`` names tasks."""
 
     label: str
     seeds: tuple[int, ...]
@@ -124,7 +124,7 @@ def comparisons(pools: Pools, resamples: int, seed: int) -> list[Comparison]:
 
 
 def profiles(pools: Pools, resamples: int, seed: int) -> list[Profile]:
-    """Of every competitor that has all tasks."""
+    """Give the performance profile of every competitor that has all tasks."""
     found = []
     for label in competitors(pools):
         runs = list(scores(pools, label).values())

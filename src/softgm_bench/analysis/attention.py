@@ -64,7 +64,7 @@ def arrays(trajectory: Trajectory) -> dict[str, Array]:
 
 
 def busiest_steps(trajectory: Trajectory, count: int = 4) -> list[int]:
-    """Of each of ``count`` equal parts of the episode, the first step with the most edges to bins."""
+    """Choose from each of ``count`` equal parts of the episode the first step with the most edges to bins."""
     edges = trajectory.observation["agents/edge"][:-1].sum(axis=(1, 2))
     parts = np.array_split(np.arange(trajectory.steps), min(count, trajectory.steps))
     return [int(part[edges[part].argmax()]) for part in parts]

@@ -13,7 +13,7 @@ MEASURES = ("success_rate", "episode_length", "discounted_return")
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """Of one algorithm on one task.
+    """A learning curve of one algorithm on one task.
 
     Attributes:
         frames: common to all seeds, ``(points,)``.

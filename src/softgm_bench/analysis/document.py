@@ -24,7 +24,7 @@ MISSING = Cell("not run", muted=True)
 
 @dataclass(frozen=True)
 class Column:
-    """Of a table; columns next to each other with the same ``group`` share a heading above their own."""
+    """A table's column; columns next to each other with the same ``group`` share a heading above their own."""
 
     name: str
     group: str = ""

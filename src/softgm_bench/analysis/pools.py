@@ -33,12 +33,12 @@ class Pool:
 
     @property
     def task(self) -> str:
-        """Of all evaluations."""
+        """Shared by all evaluations."""
         return self.evaluations[0].task
 
     @property
     def label(self) -> str:
-        """Of all evaluations."""
+        """Shared by all evaluations."""
         return self.evaluations[0].label
 
     @property

@@ -66,7 +66,7 @@ SETTINGS: dict[str, Any] = {
 
 
 def colour(label: str) -> str:
-    """Of an algorithm; one that has none of its own gets one by its name."""
+    """Give an algorithm's colour; one that has none of its own gets one by its name."""
     return COLOURS.get(label) or OTHERS[sum(label.encode()) % len(OTHERS)]
 
 
