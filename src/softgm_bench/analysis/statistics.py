@@ -23,7 +23,7 @@ def pooled(episodes: Sequence[Array]) -> tuple[float, float]:
 
 
 def standard_error(values: Array) -> Array:
-    """Estimate the standard error of the mean over the first axis: sample standard deviation / sqrt(n); NaN for a single one."""
+    """Estimate the standard error of the mean over the first axis; NaN for a single value."""
     if len(values) < 2:
         return np.full(values.shape[1:], np.nan)
     return values.std(axis=0, ddof=1) / np.sqrt(len(values))
