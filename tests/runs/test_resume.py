@@ -132,7 +132,7 @@ def test_two_states_that_differ_in_one_bit_are_told_apart(whole):
     one, other = state(whole), state(whole)
     assert differences(one, other) == []
 
-    other["environment"]["simulation"]["rod"]["position"][0, 0, 0] += 1e-12
+    other["environment"]["simulation"]["episodes"]["rod"]["position"][0, 0, 0] += 1e-12
     assert differences(one, other) == ["/environment/simulation/rod/position"]
 
 
