@@ -6,8 +6,8 @@ from refused import refusal
 
 from softgm_bench import plugins
 from softgm_bench.algorithms import algorithm_configs
-from softgm_bench.config import UserError, changed, compose, compose_untyped, config_directory, dtype_of, plain, typed
-from softgm_bench.envs import make_env
+from softgm_bench.assembly import build_env
+from softgm_bench.config import UserError, changed, compose, compose_untyped, config_directory, plain, typed
 from softgm_bench.rod.numba_backend import NumbaBackend
 from softgm_bench.rod.parameters import RodParameters
 
@@ -56,11 +56,12 @@ def plain_lists(value):
 def test_the_backend_is_the_devices_fused_kernel_unless_one_is_named_and_the_precision_is_the_rods():
     config = compose(["dtype=float32"])
     assert config.backend is None
-    env = make_env(config.task, config.rod, 1, 0, dtype=dtype_of(config))
+    env = build_env(config, 1, 0)
     assert isinstance(env.backend, NumbaBackend)
     assert env.simulation_state()["episodes", "rod", "position"].dtype == torch.float32
     assert env.reset()["tip"].dtype == torch.float32
-    assert dtype_of(compose([])) == torch.float64
+    usual = build_env(compose([]), 1, 0).simulation_state()
+    assert usual["episodes", "rod", "position"].dtype == torch.float64
 
 
 def test_the_configuration_directory_is_the_repositorys():

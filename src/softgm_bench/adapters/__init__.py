@@ -1,1 +1,1 @@
-"""Adapters."""
+"""The arm in the interfaces of PettingZoo and Gymnasium."""

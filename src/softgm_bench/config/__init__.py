@@ -18,7 +18,6 @@ from softgm_bench.config.schema import (
     Config,
     EvaluationConfig,
     ExperimentConfig,
-    dtype_of,
     labelled,
     model_name,
 )
@@ -39,7 +38,6 @@ __all__ = [
     "compose_untyped",
     "composing",
     "config_directory",
-    "dtype_of",
     "labelled",
     "model_name",
     "plain",

@@ -97,13 +97,6 @@ def labelled(algo: str, model: str, observation: str, perturbation: str) -> str:
     return "_".join([algo, *(value for default, value in usual.items() if value != default)])
 
 
-def dtype_of(config: Config) -> Any:
-    """The ``torch.dtype`` of the rod's state; torch is imported late because that takes seconds."""
-    import torch
-
-    return getattr(torch, config.dtype)
-
-
 def group_schemas() -> dict[str, dict[str, type]]:
     """Dataclass of every task, algorithm and model by name; imported late because it brings torch along."""
     from softgm_bench.algorithms import algorithm_configs

@@ -1,1 +1,1 @@
-"""Episodes."""
+"""The episodes that policies play: evaluation, recording, recorded trajectories, and their simulation again."""

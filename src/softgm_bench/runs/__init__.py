@@ -1,1 +1,1 @@
-"""Experiment."""
+"""One run: the loop, its folder, checkpoints and resuming, metrics, loggers, settings of the machine."""

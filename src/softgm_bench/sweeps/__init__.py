@@ -1,1 +1,1 @@
-"""Sweeps."""
+"""Many runs: the cells of a grid in processes of their own, and what became of each."""
