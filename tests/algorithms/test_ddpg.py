@@ -3,9 +3,9 @@ import dataclasses
 import pytest
 import torch
 from bandit import ENV, LEARNS_FAST, error_after_learning
-from off_policy_cases import SHORT, SMALL, batches, filled, says, three_ends
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from off_policy_cases import SHORT, SMALL, batches, filled, says, three_ends
 from softgm_bench.algorithms.ddpg import DDPG, DDPGConfig
 from softgm_bench.algorithms.off_policy import AGENT_REWARD
 from softgm_bench.envs import entries, make_env

@@ -1,7 +1,7 @@
 import pytest
 import torch
-from off_policy_cases import SHORT, SMALL, batches, copied
 
+from off_policy_cases import SHORT, SMALL, batches, copied
 from softgm_bench.algorithms import build_algorithm
 from softgm_bench.algorithms.ddpg import DDPGConfig
 from softgm_bench.algorithms.registry import algorithm_configs

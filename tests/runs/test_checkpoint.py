@@ -41,37 +41,16 @@ def test_only_the_newest_are_kept_in_the_order_of_frames(tmp_path):
     paths = [checkpoint.save(folder(tmp_path), frames, {}, keep=2) for frames in (900, 1000, 20000)]
 
     assert sorted(folder(tmp_path).checkpoints.iterdir()) == paths[1:]
-    assert folder(tmp_path).newest() == paths[-1]
-    assert RunFolder(tmp_path / "nowhere").newest() is None
 
 
-def test_damaged_foreign_and_missing_files_are_refused_in_one_line(tmp_path):
+def test_damaged_and_foreign_files_are_refused_in_one_line(tmp_path):
+    """Which damage there can be is a matter of ``storage.archive``."""
     path = checkpoint.save(folder(tmp_path), 1, a_state(), keep=1)
     whole = path.read_bytes()
-    foreign = tmp_path / "foreign.pt"
-    torch.save({"weights": torch.ones(2)}, foreign)
-
-    flipped = bytearray(whole)
-    flipped[whole.index(torch.get_rng_state()[100:200].numpy().tobytes())] ^= 1
-    for content in (bytes(flipped), whole[: len(whole) // 2], whole[:10], b"", b"not a checkpoint"):
-        path.write_bytes(content)
-        with pytest.raises(UserError, match=r"^\S+: damaged or no checkpoint[^\n]*$"):
-            checkpoint.load(path)
-    with pytest.raises(UserError, match="no checkpoint of this program"):
-        checkpoint.load(foreign)
-    with pytest.raises(UserError, match="No such file"):
-        checkpoint.load(tmp_path / "missing.pt")
-
-
-class Bomb:
-    def __reduce__(self):
-        return print, ("boom",)
-
-
-def test_loading_runs_no_code_from_the_file(tmp_path, capsys):
-    path = tmp_path / "bomb.pt"
-    torch.save({"format": checkpoint.FORMATS[-1], "bomb": Bomb()}, path)
-
-    with pytest.raises(UserError):
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(UserError, match=r"^\S+: damaged or no checkpoint[^\n]*$"):
         checkpoint.load(path)
-    assert "boom" not in capsys.readouterr().out
+    for foreign in ({"weights": torch.ones(2)}, {"format": 99, "algorithm": {}}, {"format": 2, "policy": {}}):
+        torch.save(foreign, path)
+        with pytest.raises(UserError, match=r"^\S+: no checkpoint of this program[^\n]*$"):
+            checkpoint.load(path)
