@@ -6,7 +6,9 @@ from softgm_bench import process
 
 
 def python(code, **variables):
-    environment = {name: value for name, value in os.environ.items() if name not in process.SETTINGS} | variables
+    environment = {
+        name: value for name, value in os.environ.items() if name not in {*process.SETTINGS, "OMP_WAIT_POLICY"}
+    } | variables
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     return done.stdout.strip()
@@ -56,3 +58,14 @@ def test_products_stay_float32_whatever_came_before():
     use_onednn += "; torch.backends.mkldnn.matmul.fp32_precision = 'none'"
     for before in ("", use_onednn):
         assert python(code.format(before=before)) == "True"
+
+
+def test_asking_for_the_python_interface_prepares_the_process_before_torch_is_loaded():
+    seen = "print(os.environ['GOMP_SPINCOUNT'], os.environ['ONEDNN_MAX_CPU_ISA'])"
+    for asking in ("softgm_bench.train", "from softgm_bench import api"):
+        assert python(f"import os, softgm_bench; {asking}; {seen}") == "2000 AVX512_CORE"
+    noted = (
+        "import sys, softgm_bench\nfrom softgm_bench import process\n"
+        "process.prepare = lambda: print('torch' in sys.modules)\nsoftgm_bench.load"
+    )
+    assert python(noted) == "False"

@@ -1,7 +1,8 @@
 """Reference benchmark for distributed control of soft robotic arms.
 
 What most users need is here and loaded when it is first asked for, because torch takes seconds; the rest of the Python
-interface is ``softgm_bench.api``.
+interface is ``softgm_bench.api``. Asking for any of it prepares the process (``softgm_bench.process``), importing the
+package does not.
 """
 
 from importlib import import_module
@@ -14,14 +15,16 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 __all__ = ["SoftArmEnv", "__version__", "evaluate", "load", "make_env", "train"]
 
-_HOMES = {"SoftArmEnv": "envs"} | dict.fromkeys(("evaluate", "load", "make_env", "train"), "api")
+_HOMES = {"SoftArmEnv": "envs"} | dict.fromkeys(("api", "evaluate", "load", "make_env", "train"), "api")
 
 
 def __getattr__(name: str) -> Any:
-    """Load what is listed in ``__all__`` from its home."""
+    """Prepare the process and load what is listed in ``__all__``, or ``api``, from its home."""
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    import_module(f"{__name__}.process").prepare()
+    home = import_module(f"{__name__}.{_HOMES[name]}")
+    return home if name == _HOMES[name] else getattr(home, name)
 
 
 def __dir__() -> list[str]:

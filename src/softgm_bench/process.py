@@ -1,6 +1,6 @@
 """Environment variables that count only if they are set before torch is loaded, or before its first product.
 
-Entry points call ``prepare`` first; importing the package sets nothing.
+Entry points call ``prepare`` first: commands, and the package when it is asked for a part of its Python interface.
 """
 
 import os
