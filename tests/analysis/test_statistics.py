@@ -116,9 +116,7 @@ def test_improvement_and_its_interval_are_rliables(scores, rliable):
         {"x,y": (x, y)}, lambda a, b: np.array([metrics.probability_of_improvement(a, b)]), reps=500
     )
     assert statistics.probability_of_improvement(tasks(x), tasks(y)) == pytest.approx(point["x,y"][0])
-    interval = Bootstrap(RESAMPLES, 0).interval(
-        "", statistics.probability_of_improvement, tasks(x), tasks(y)
-    )
+    interval = Bootstrap(RESAMPLES, 0).interval("", statistics.probability_of_improvement, tasks(x), tasks(y))
     np.testing.assert_allclose(interval, expected["x,y"][:, 0], atol=0.04)  # 500 resamples
 
 
@@ -136,8 +134,6 @@ def test_profiles_and_their_intervals_are_rliables(scores, rliable):
 
 def test_the_bootstrap_repeats_for_a_seed_and_changes_with_it():
     values = [np.random.default_rng(6).random(7)]
-    first, again, other = (
-        Bootstrap(500, seed).interval("", statistics.iqm, values) for seed in (0, 0, 1)
-    )
+    first, again, other = (Bootstrap(500, seed).interval("", statistics.iqm, values) for seed in (0, 0, 1))
     np.testing.assert_array_equal(first, again)
     assert (first != other).any()

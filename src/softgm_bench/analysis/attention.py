@@ -105,15 +105,15 @@ def draw_step(trajectory: Trajectory, step: int, heads: bool = False) -> Canvas:
     total = TOP + len(rows) * pitch + ((1.1 if heads else 1.25) if bins.labels else 0.6)
     top = total - TOP
     canvas = Canvas(figsize=(right + max(RIGHT, 2.1 - widths[-1]), total))
-    for left, wide, (stage, columns) in zip(LEFT + offsets, widths, names.items(), strict=True):
-        _text(canvas, left, top + 0.24, STAGES[stage], fontsize=9, weight="bold")
-        shown = np.concatenate([np.arange(n), n + bins.slots]) if stage == "stage1" else np.arange(n)
-        allowed = _allowed(trajectory, step, stage)[:, shown]
-        for row, (layer, head) in enumerate(rows):
+    for row, (layer, head) in enumerate(rows):
+        for left, wide, (stage, columns) in zip(LEFT + offsets, widths, names.items(), strict=True):
+            if row == 0:
+                _text(canvas, left, top + 0.24, STAGES[stage], fontsize=9, weight="bold")
             weights = trajectory.attention[stage][step, layer]
             matrix = weights.mean(axis=0) if head is None else weights[head]
+            shown = np.concatenate([np.arange(n), n + bins.slots]) if stage == "stage1" else np.arange(n)
             axes = _axes(canvas, left, top - row * pitch - high, wide, high)
-            _matrix(axes, matrix[:, shown], allowed, cell)
+            _matrix(axes, matrix[:, shown], _allowed(trajectory, step, stage)[:, shown], cell)
             axes.set_yticks(np.arange(n) + 0.5, agents if left == LEFT else [""] * n)
             last = row == len(rows) - 1
             axes.set_xticks(np.arange(len(columns)) + 0.5, columns if last else [""] * len(columns), rotation=90)
