@@ -132,8 +132,8 @@ def test_two_states_that_differ_in_one_bit_are_told_apart(whole):
     one, other = state(whole), state(whole)
     assert differences(one, other) == []
 
-    other["environment"]["simulation"]["rod"]["position"][0, 0, 0] += 1e-12
-    assert differences(one, other) == ["/environment/simulation/rod/position"]
+    other["environment"]["simulation"]["episodes"]["rod"]["position"][0, 0, 0] += 1e-12
+    assert differences(one, other) == ["/environment/simulation/episodes/rod/position"]
 
 
 def test_without_the_replay_gradient_steps_pause_until_it_has_filled_again(tmp_path):
