@@ -43,9 +43,7 @@ def report(arguments: list[str]) -> None:
         raise UserError(f"seed={options.seed}: it must be 0 or more")
     from softgm_bench.analysis.runs import find
 
-    found = find(root)
-    if options.evaluations is not None:
-        found = found + find(Path(options.evaluations))
+    found = find(root, *([Path(options.evaluations)] if options.evaluations is not None else []))
     if not found.runs:
         known = f"; {found.problems[0].folder} is {found.problems[0].reason}" if found.problems else ""
         raise UserError(f"{root}: no finished run below it; a run's folder holds config.yaml and summary.json{known}")
@@ -57,11 +55,11 @@ def report(arguments: list[str]) -> None:
     from softgm_bench.analysis.build import build
     from softgm_bench.analysis.marl_eval import export
     from softgm_bench.analysis.pools import newest
-    from softgm_bench.analysis.tables import Drawing
+    from softgm_bench.analysis.statistics import Bootstrap
 
     out = Path(options.out)
     (out / "figures").mkdir(parents=True, exist_ok=True)  # before the work whose result it takes
-    document = build(found, Drawing(options.resamples, options.seed))
+    document = build(found, Bootstrap(options.resamples, options.seed))
     made_with = {"matplotlib": matplotlib.__version__, "resamples": options.resamples, "seed": options.seed}
     files = {
         "report.md": markdown.render(document).encode(),

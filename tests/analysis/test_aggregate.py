@@ -2,11 +2,13 @@ import numpy as np
 import pytest
 
 from made_up_runs import write_run
-from softgm_bench.analysis.aggregate import THRESHOLDS, aggregates, comparisons, competitors, profiles
+from softgm_bench.analysis.aggregate import THRESHOLDS, aggregates, comparisons, success_rates
 from softgm_bench.analysis.pools import newest, pool_runs
 from softgm_bench.analysis.runs import find
+from softgm_bench.analysis.statistics import Bootstrap
 
 TASKS = ("basic", "structured", "wall")
+BOOTSTRAP = Bootstrap(resamples=200, seed=0)
 
 
 @pytest.fixture(scope="module")
@@ -24,11 +26,11 @@ def pools(tmp_path_factory):
 
 
 def test_neither_ablations_nor_oracles_compete(pools):
-    assert competitors(pools) == ["ippo", "mappo", "softgm"]
+    assert list(success_rates(pools)) == ["ippo", "mappo", "softgm"]
 
 
 def test_an_interval_needs_several_seeds_and_an_aggregate_every_task(pools):
-    entries = {entry.label: entry for entry in aggregates(pools, 200, 0)}
+    entries = {entry.label: entry for entry in aggregates(pools, BOOTSTRAP)}
     assert entries["softgm"].iqm.interval is not None
     assert entries["ippo"].iqm.interval is None
     assert entries["mappo"].iqm is None
@@ -36,7 +38,7 @@ def test_an_interval_needs_several_seeds_and_an_aggregate_every_task(pools):
 
 
 def test_aggregates_are_of_the_success_rates_of_runs(pools):
-    (entry,) = [entry for entry in aggregates(pools, 200, 0) if entry.label == "softgm"]
+    (entry,) = [entry for entry in aggregates(pools, BOOTSTRAP) if entry.label == "softgm"]
     rates = np.concatenate([pools[task, "softgm"].success_rates for task in TASKS])
     assert entry.mean.value == pytest.approx(rates.mean())
     assert entry.iqm.value == pytest.approx(np.sort(rates)[2:7].mean())
@@ -45,7 +47,7 @@ def test_aggregates_are_of_the_success_rates_of_runs(pools):
 
 
 def test_each_pair_is_compared_once_over_the_tasks_that_both_have(pools):
-    pairs = {(pair.first, pair.second): pair for pair in comparisons(pools, 200, 0)}
+    pairs = {(pair.first, pair.second): pair for pair in comparisons(pools, BOOTSTRAP)}
     assert set(pairs) == {("mappo", "ippo"), ("softgm", "ippo"), ("softgm", "mappo")}
     assert pairs["softgm", "ippo"].tasks == TASKS
     assert pairs["softgm", "mappo"].tasks == ("basic",)
@@ -54,9 +56,9 @@ def test_each_pair_is_compared_once_over_the_tasks_that_both_have(pools):
 
 
 def test_a_profile_falls_from_all_runs_to_none(pools):
-    drawn = {profile.label: profile for profile in profiles(pools, 200, 0)}
+    drawn = {entry.label: entry.profile for entry in aggregates(pools, BOOTSTRAP) if entry.profile}
     assert set(drawn) == {"softgm", "ippo"}
-    share = drawn["softgm"].share
+    share = drawn["softgm"].value
     assert share[0] == 1.0
     assert share[-1] == 0.0
     assert (np.diff(share) <= 0).all()

@@ -2,7 +2,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from softgm_bench.analysis.curves import curve
+from softgm_bench.analysis.figures import curve
 
 
 def run(frames, values):
@@ -12,20 +12,15 @@ def run(frames, values):
 
 
 def test_seeds_at_the_same_frames_keep_them():
-    drawn = curve([run([10, 20], [0.0, 1.0]), run([10, 20], [0.5, 0.5])], "success_rate")
-    np.testing.assert_array_equal(drawn.frames, [10, 20])
-    np.testing.assert_array_equal(drawn.mean, [0.25, 0.75])
-    np.testing.assert_allclose(drawn.error, [0.25, 0.25])
+    frames, seeds = curve([run([10, 20], [0.0, 1.0]), run([10, 20], [0.5, 0.5])], "success_rate")
+    np.testing.assert_array_equal(frames, [10, 20])
+    np.testing.assert_array_equal(seeds, [[0.0, 1.0], [0.5, 0.5]])
 
 
 def test_seeds_at_other_frames_are_interpolated_where_all_have_values():
-    drawn = curve([run([0, 10, 20], [0.0, 1.0, 2.0]), run([5, 15], [0.0, 1.0])], "success_rate")
-    np.testing.assert_array_equal(drawn.frames, [5, 10, 15])
-    np.testing.assert_allclose(drawn.seeds, [[0.5, 1.0, 1.5], [0.0, 0.5, 1.0]])
-
-
-def test_one_seed_has_no_error():
-    assert np.isnan(curve([run([1, 2], [0.0, 1.0])], "success_rate").error).all()
+    frames, seeds = curve([run([0, 10, 20], [0.0, 1.0, 2.0]), run([5, 15], [0.0, 1.0])], "success_rate")
+    np.testing.assert_array_equal(frames, [5, 10, 15])
+    np.testing.assert_allclose(seeds, [[0.5, 1.0, 1.5], [0.0, 0.5, 1.0]])
 
 
 def test_there_is_no_curve_of_what_was_not_recorded():

@@ -3,6 +3,9 @@ import pytest
 from made_up_runs import write_evaluation, write_run
 from softgm_bench.analysis.pools import newest, pool_evaluations, pool_runs, wilson
 from softgm_bench.analysis.runs import find
+from softgm_bench.analysis.statistics import Bootstrap
+
+BOOTSTRAP = Bootstrap(resamples=500, seed=0)
 
 
 def pools_of(path):
@@ -27,19 +30,19 @@ def test_what_was_not_recorded_is_none(tmp_path):
 def test_one_seed_has_wilsons_interval_and_several_the_bootstraps(tmp_path):
     write_run(tmp_path, "basic", "softgm", 0, success=0.5)
     pool = pools_of(tmp_path)["basic", "softgm"]
-    assert pool.success_interval(500, 0) == wilson(pool.evaluations[0])
+    assert pool.success_interval(BOOTSTRAP) == wilson(pool.evaluations[0])
     write_run(tmp_path, "basic", "softgm", 1, success=0.9)
     pool = pools_of(tmp_path)["basic", "softgm"]
-    low, high = pool.success_interval(500, 0)
+    low, high = pool.success_interval(BOOTSTRAP)
     assert (low, high) == (pool.success_rates.min(), pool.success_rates.max())  # two seeds: either twice is likely
 
 
 def test_an_interval_does_not_depend_on_what_else_was_run(tmp_path):
     for seed in range(3):
         write_run(tmp_path, "basic", "softgm", seed, success=0.5)
-    alone = pools_of(tmp_path)["basic", "softgm"].success_interval(500, 0)
+    alone = pools_of(tmp_path)["basic", "softgm"].success_interval(BOOTSTRAP)
     write_run(tmp_path, "basic", "mappo", 0)
-    assert pools_of(tmp_path)["basic", "softgm"].success_interval(500, 0) == alone
+    assert pools_of(tmp_path)["basic", "softgm"].success_interval(BOOTSTRAP) == alone
 
 
 def test_of_two_runs_with_the_same_seed_the_longer_counts_and_the_other_is_named(tmp_path):

@@ -1,8 +1,11 @@
+from functools import partial
+
 import numpy as np
 import pytest
 import scipy.stats
 
 from softgm_bench.analysis import statistics
+from softgm_bench.analysis.statistics import Bootstrap
 
 # rliable draws from numpy's global generator; 4000 resamples leave about 0.005 of noise on a bound.
 RESAMPLES = 4000
@@ -32,23 +35,23 @@ def test_the_interquartile_mean_is_scipys_trimmed_mean():
     generator = np.random.default_rng(1)
     for count in range(1, 30):
         values = generator.normal(size=count)
-        assert statistics.iqm(values) == pytest.approx(scipy.stats.trim_mean(values, 0.25), rel=1e-12)
+        assert statistics.iqm([values]) == pytest.approx(scipy.stats.trim_mean(values, 0.25), rel=1e-12)
 
 
 def test_the_interquartile_mean_ignores_outliers_on_both_sides():
-    assert statistics.iqm(np.array([-1e9, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 1e9])) == 3.5
+    assert statistics.iqm([np.array([-1e9, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 1e9])]) == 3.5
 
 
 def test_improvement_is_the_mann_whitney_statistic_over_its_largest_value():
     generator = np.random.default_rng(2)
     ours, theirs = generator.integers(0, 4, 7) / 4, generator.integers(0, 4, 5) / 4  # with ties
     expected = scipy.stats.mannwhitneyu(ours, theirs).statistic / (7 * 5)
-    assert statistics.improvement(ours, theirs) == pytest.approx(expected, rel=1e-12)
+    assert statistics.probability_of_improvement([ours], [theirs]) == pytest.approx(expected, rel=1e-12)
 
 
 def test_improvement_by_hand():
     ours, theirs = np.array([1.0, 3.0]), np.array([1.0, 2.0])
-    assert statistics.improvement(ours, theirs) == (0.5 + 0.0 + 1.0 + 1.0) / 4
+    assert statistics.probability_of_improvement([ours], [theirs]) == (0.5 + 0.0 + 1.0 + 1.0) / 4
 
 
 def test_of_two_algorithms_one_improves_or_the_other():
@@ -59,29 +62,21 @@ def test_of_two_algorithms_one_improves_or_the_other():
 
 
 def test_a_profile_by_hand():
-    share = statistics.performance_profile(np.array([0.2, 0.5, 0.5, 1.0]), np.array([0.0, 0.2, 0.4, 0.5, 1.0]))
+    share = statistics.performance_profile([np.array([0.2, 0.5, 0.5, 1.0])], np.array([0.0, 0.2, 0.4, 0.5, 1.0]))
     np.testing.assert_allclose(share, [1.0, 0.75, 0.75, 0.25, 0.0])
 
 
-def test_pooled_is_numpys_mean_and_population_deviation_of_all_episodes():
-    seeds = [np.array([1.0, 2.0, 3.0]), np.array([10.0])]
-    assert statistics.pooled(seeds) == (4.0, np.std([1.0, 2.0, 3.0, 10.0]))
-
-
-def test_the_standard_error_is_scipys():
-    values = np.random.default_rng(4).random((5, 3))
-    np.testing.assert_allclose(statistics.standard_error(values), scipy.stats.sem(values, axis=0))
-
-
-def test_one_seed_has_no_standard_error():
-    assert np.isnan(statistics.standard_error(np.ones((1, 3)))).all()
-
-
 def test_resampling_stays_within_a_task():
-    drawn = statistics.resample([np.array([1.0, 2.0]), np.array([3.0])], 50, np.random.default_rng(0))
+    scores = [np.array([1.0, 2.0]), np.array([3.0, 3.0])]
+    drawn = []
+    Bootstrap(50, 0).interval("", lambda tasks: drawn.extend(tasks) or statistics.mean(tasks), scores)
     assert drawn[0].shape == (50, 2)
     assert set(drawn[0].ravel()) == {1.0, 2.0}
     assert set(drawn[1].ravel()) == {3.0}
+
+
+def test_a_single_run_on_a_task_gives_no_interval():
+    assert Bootstrap(50, 0).interval("", statistics.mean, [np.array([1.0, 2.0]), np.array([3.0])]) is None
 
 
 def test_the_interval_of_a_mean_is_scipys_bootstrap():
@@ -89,7 +84,7 @@ def test_the_interval_of_a_mean_is_scipys_bootstrap():
     expected = scipy.stats.bootstrap(
         (values,), np.mean, n_resamples=RESAMPLES, method="percentile", rng=np.random.default_rng(0)
     ).confidence_interval
-    interval = statistics.mean_interval([values], RESAMPLES, np.random.default_rng(1))
+    interval = Bootstrap(RESAMPLES, 1).interval("", statistics.mean, [values])
     np.testing.assert_allclose(interval, expected, atol=TOLERANCE)
 
 
@@ -99,8 +94,8 @@ def test_the_interval_of_the_interquartile_mean_is_rliables(scores, rliable):
         scores, lambda matrix: np.array([metrics.aggregate_iqm(matrix)]), reps=RESAMPLES
     )
     for name, matrix in scores.items():
-        assert statistics.iqm(matrix.ravel()) == pytest.approx(metrics.aggregate_iqm(matrix))
-        interval = statistics.iqm_interval(tasks(matrix), RESAMPLES, np.random.default_rng(0))
+        assert statistics.iqm(tasks(matrix)) == pytest.approx(metrics.aggregate_iqm(matrix))
+        interval = Bootstrap(RESAMPLES, 0).interval("", statistics.iqm, tasks(matrix))
         np.testing.assert_allclose(interval, expected[name][:, 0], atol=TOLERANCE)
 
 
@@ -110,7 +105,7 @@ def test_the_interval_of_the_mean_over_tasks_is_rliables(scores, rliable):
         scores, lambda matrix: np.array([metrics.aggregate_mean(matrix)]), reps=RESAMPLES
     )
     for name, matrix in scores.items():
-        interval = statistics.mean_interval(tasks(matrix), RESAMPLES, np.random.default_rng(0))
+        interval = Bootstrap(RESAMPLES, 0).interval("", statistics.mean, tasks(matrix))
         np.testing.assert_allclose(interval, expected[name][:, 0], atol=TOLERANCE)
 
 
@@ -121,23 +116,24 @@ def test_improvement_and_its_interval_are_rliables(scores, rliable):
         {"x,y": (x, y)}, lambda a, b: np.array([metrics.probability_of_improvement(a, b)]), reps=500
     )
     assert statistics.probability_of_improvement(tasks(x), tasks(y)) == pytest.approx(point["x,y"][0])
-    interval = statistics.improvement_interval(tasks(x), tasks(y), RESAMPLES, np.random.default_rng(0))
+    interval = Bootstrap(RESAMPLES, 0).interval("", statistics.probability_of_improvement, tasks(x), tasks(y))
     np.testing.assert_allclose(interval, expected["x,y"][:, 0], atol=0.04)  # 500 resamples
 
 
 def test_profiles_and_their_intervals_are_rliables(scores, rliable):
     library, _ = rliable
     thresholds = np.linspace(0.1, 0.9, 5)
+    profile = partial(statistics.performance_profile, thresholds=thresholds)
     points, expected = library.create_performance_profile(scores, thresholds, reps=RESAMPLES)
     for name, matrix in scores.items():
-        np.testing.assert_allclose(statistics.performance_profile(matrix.ravel(), thresholds), points[name])
-        interval = statistics.profile_interval(tasks(matrix), thresholds, RESAMPLES, np.random.default_rng(0))
+        np.testing.assert_allclose(profile(tasks(matrix)), points[name])
+        interval = Bootstrap(RESAMPLES, 0).interval("", profile, tasks(matrix))
         step = 1 / matrix.size  # a profile's values are multiples of it
         np.testing.assert_allclose(interval, expected[name], atol=1.01 * step)
 
 
 def test_the_bootstrap_repeats_for_a_seed_and_changes_with_it():
     values = [np.random.default_rng(6).random(7)]
-    first, again, other = (statistics.iqm_interval(values, 500, np.random.default_rng(seed)) for seed in (0, 0, 1))
+    first, again, other = (Bootstrap(500, seed).interval("", statistics.iqm, values) for seed in (0, 0, 1))
     np.testing.assert_array_equal(first, again)
     assert (first != other).any()

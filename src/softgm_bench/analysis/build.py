@@ -1,12 +1,14 @@
 """Puts a report together from what was found."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 
-from softgm_bench.analysis import aggregate, figures, names, overview, paper, tables
+from softgm_bench.analysis import aggregate, figures, names, paper, tables
 from softgm_bench.analysis.document import Block, Document, Section
-from softgm_bench.analysis.pools import Pool, newest, pool_evaluations, pool_runs
+from softgm_bench.analysis.pools import Pools, by_algorithm, by_condition, newest, pool_evaluations, pool_runs
 from softgm_bench.analysis.runs import Found, Run
+from softgm_bench.analysis.statistics import Bootstrap
+from softgm_bench.analysis.style import look
 
 TITLE = "Report of softgm_bench"
 ONE_SEED = (
@@ -21,30 +23,29 @@ TORQUE = (
 )
 
 
-def build(found: Found, drawing: tables.Drawing) -> Document:
-    """The whole report; the same input gives the same document."""
+@look()
+def build(found: Found, bootstrap: Bootstrap) -> Document:
+    """Build the whole report; the same input gives the same document."""
     runs, replaced = newest(found.runs)
-    pools = pool_runs(runs)
-    perturbed = pool_evaluations(found.evaluations)
-    grouped: dict[tuple[str, str], list[Run]] = {}
-    for run in runs:
-        grouped.setdefault((run.final.task, run.final.label), []).append(run)
-    return Document(
-        TITLE,
-        [
-            Section("What was found", [*_summary(found, runs)]),
-            Section("Comparison with the paper", _comparison(pools, drawing)),
-            Section("Robustness", _robustness(pools, perturbed, drawing)),
-            Section("Learning curves", _curves(grouped)),
-            Section("Ablations", _ablations(pools, grouped, drawing)),
-            Section("Over all tasks", _over_tasks(pools, drawing)),
-            Section("Sources", _sources(found, runs, replaced)),
-            Section("How the numbers are made", _method(drawing)),
+    grouped, pools = by_algorithm(runs), pool_runs(runs)
+    sections: dict[str, Iterable[Block | None]] = {
+        "What was found": _summary(found, runs),
+        "Comparison with the paper": _comparison(pools, bootstrap),
+        "Robustness": _robustness(found, pools, bootstrap),
+        "Learning curves": [_curves(grouped) or "Not run."],
+        "Ablations": [tables.ablations(pools, bootstrap), _ablations(grouped)],
+        "Over all tasks": _over_tasks(pools, bootstrap),
+        "Sources": [
+            tables.sources(runs),
+            tables.evaluation_sources(found.evaluations) if found.evaluations else None,
+            tables.left_out(found.problems, replaced) if found.problems or replaced else None,
         ],
-    )
+        "How the numbers are made": _method(bootstrap),
+    }
+    return Document(TITLE, [Section(title, [one for one in blocks if one]) for title, blocks in sections.items()])
 
 
-def _summary(found: Found, runs: Sequence[Run]) -> list[Block]:
+def _summary(found: Found, runs: Sequence[Run]) -> list[Block | None]:
     tasks = sorted({run.final.task for run in runs})
     labels = sorted({run.final.label for run in runs})
     seeds = Counter((run.final.task, run.final.label) for run in runs).values()
@@ -54,96 +55,72 @@ def _summary(found: Found, runs: Sequence[Run]) -> list[Block]:
         f"that was run: {names.span(list(seeds))}. Evaluations beside training: {len(found.evaluations)}. Folders "
         f"left out: {out}"
     )
-    text += "; the section Sources says why." if out else "."
-    return [text, *([ONE_SEED] if 1 in seeds else [])]
+    return [text + ("; the section Sources says why." if out else "."), ONE_SEED if 1 in seeds else None]
 
 
-def _others(pools: Mapping[tuple[str, str], Pool], task: str) -> list[str]:
-    """Algorithms on a task that are neither the paper's nor its ablations; ranked ones first."""
+def _comparison(pools: Pools, bootstrap: Bootstrap) -> list[Block | None]:
+    """Tables of the paper's tasks, with other algorithms below, ranked ones first; then of other tasks."""
     known = {*paper.ALGORITHMS, *paper.ABLATIONS}
-    there = [label for where, label in pools if where == task and label not in known]
-    return sorted(there, key=lambda label: (not pools[task, label].ranked, label))
-
-
-def _comparison(pools: Mapping[tuple[str, str], Pool], drawing: tables.Drawing) -> list[Block]:
-    blocks: list[Block] = [TORQUE]
-    for task in paper.TASKS:
-        blocks.append(tables.table_one(task, pools, [*paper.ALGORITHMS, *_others(pools, task)], drawing))
-    for task in sorted({task for task, _ in pools} - set(paper.TASKS)):
+    blocks: list[Block | None] = [TORQUE]
+    for task in [*paper.TASKS, *sorted({task for task, _ in pools} - set(paper.TASKS))]:
         there = sorted(label for where, label in pools if where == task)
-        blocks.append(tables.table_one(task, pools, there, drawing))
-    labels = [*paper.ALGORITHMS, *sorted({label for task in paper.TASKS for label in _others(pools, task)})]
-    drawn = figures.time_to_target(pools, paper.TASKS, labels)
-    return [*blocks, *([drawn] if drawn else [])]
+        if task in paper.TASKS:
+            others = [label for label in there if label not in known]
+            there = [*paper.ALGORITHMS, *sorted(others, key=lambda label: not pools[task, label].ranked)]
+        blocks.append(tables.table_one(task, pools, there, bootstrap))
+    others = sorted({label for task, label in pools if task in paper.TASKS} - known)
+    return [*blocks, figures.time_to_target(pools, paper.TASKS, [*paper.ALGORITHMS, *others])]
 
 
-def _robustness(
-    pools: Mapping[tuple[str, str], Pool], perturbed: Mapping[tuple[str, str, str], Pool], drawing: tables.Drawing
-) -> list[Block]:
-    drawn = figures.robustness(pools, perturbed, drawing.resamples, drawing.seed)
-    return [tables.table_two(pools, perturbed, drawing), *([drawn] if drawn else [])]
+def _robustness(found: Found, pools: Pools, bootstrap: Bootstrap) -> list[Block | None]:
+    perturbed = pool_evaluations(found.evaluations)
+    conditions = by_condition(pools, perturbed)
+    evaluated = {subject: rows for subject, rows in conditions.items() if subject in {key[:2] for key in perturbed}}
+    return [tables.table_two(pools, conditions, bootstrap), figures.robustness(evaluated, bootstrap)]
 
 
-def _curves(grouped: figures.RunsByKey) -> list[Block]:
+def _curves(grouped: figures.RunsByKey) -> Block | None:
     tasks = [*paper.TASKS, *sorted({task for task, _ in grouped} - set(paper.TASKS))]
-    labels = [
-        *paper.ALGORITHMS,
-        *sorted({label for _, label in grouped} - set(paper.ALGORITHMS) - set(paper.ABLATIONS)),
-    ]
+    others = {label for _, label in grouped} - set(paper.ALGORITHMS) - set(paper.ABLATIONS)
     caption = (
         "Evaluations during training: mean over seeds, shaded the standard error, thin lines single "
         "seeds. Dashed: independent critics."
     )
-    drawn = figures.learning_curves("learning_curves", grouped, tasks, labels, tuple(figures.AXIS_NAMES), caption)
-    return [drawn or "Not run."]
+    labels, measures = [*paper.ALGORITHMS, *sorted(others)], tuple(figures.AXIS_NAMES)
+    return figures.learning_curves("learning_curves", grouped, tasks, labels, measures, caption)
 
 
-def _ablations(
-    pools: Mapping[tuple[str, str], Pool], grouped: figures.RunsByKey, drawing: tables.Drawing
-) -> list[Block]:
-    blocks: list[Block] = [tables.ablations(pools, drawing)]
-    without = {key: runs for key, runs in grouped.items() if key[1] in paper.ABLATIONS[1:]}
-    if not without:
-        return [*blocks, "No ablation was run: there is no figure."]
-    tasks = [task for task in paper.TASKS if any(where == task for where, _ in without)]
+def _ablations(grouped: figures.RunsByKey) -> Block | None:
+    run = {task for task, label in grouped if label in paper.ABLATIONS[1:]}
+    if not run:
+        return "No ablation was run: there is no figure."
+    tasks = [task for task in paper.TASKS if task in run]
     caption = "SoftGM and its ablations, evaluations during training: mean over seeds, shaded the standard error."
     measures = ("success_rate", "episode_length")
-    drawn = figures.learning_curves("ablations", grouped, tasks, paper.ABLATIONS, measures, caption)
-    return [*blocks, *([drawn] if drawn else [])]
+    return figures.learning_curves("ablations", grouped, tasks, paper.ABLATIONS, measures, caption)
 
 
-def _over_tasks(pools: Mapping[tuple[str, str], Pool], drawing: tables.Drawing) -> list[Block]:
-    entries = aggregate.aggregates(pools, drawing.resamples, drawing.seed)
-    pairs = aggregate.comparisons(pools, drawing.resamples, drawing.seed)
-    curves = aggregate.profiles(pools, drawing.resamples, drawing.seed)
-    blocks: list[Block | None] = [
-        overview.aggregates(entries),
+def _over_tasks(pools: Pools, bootstrap: Bootstrap) -> list[Block | None]:
+    entries = aggregate.aggregates(pools, bootstrap)
+    pairs = aggregate.comparisons(pools, bootstrap)
+    return [
+        tables.aggregates(entries),
         figures.aggregate_scores(entries),
-        figures.performance_profiles(curves) or "No algorithm was run on all three tasks: no performance profile.",
-        overview.comparisons(pairs) if pairs else "No two algorithms were run on the same task: none can be compared.",
+        figures.performance_profiles(entries) or "No algorithm was run on all three tasks: no performance profile.",
+        tables.comparisons(pairs) if pairs else "No two algorithms were run on the same task: none can be compared.",
         figures.improvement(pairs),
     ]
-    return [block for block in blocks if block is not None]
 
 
-def _sources(found: Found, runs: Sequence[Run], replaced: Sequence[tuple[Run, Run]]) -> list[Block]:
-    blocks: list[Block] = [overview.sources(runs)]
-    if found.evaluations:
-        blocks.append(overview.evaluation_sources(found.evaluations))
-    if found.problems or replaced:
-        blocks.append(overview.left_out(found.problems, replaced))
-    return blocks
-
-
-def _method(drawing: tables.Drawing) -> list[Block]:
+def _method(bootstrap: Bootstrap) -> list[Block | None]:
     return [
         "Mean ± standard deviation: over all episodes of all seeds together (population). Success: mean over seeds of "
         "a seed's share of successful episodes; an episode that diverged is none. Ranks compare success rates on one "
         "task; an oracle and training under a perturbation are never ranked, training with a curriculum only where "
         "every ranked run had one.",
-        f"Intervals cover 95 %. Over seeds: percentiles of a stratified bootstrap ({drawing.resamples:,} resamples, "
-        f"seed {drawing.seed}), which draws runs with replacement within each task (Agarwal et al. 2021). Of a single "
-        "policy: Wilson's score interval over its episodes.",
+        f"Intervals cover 95 %. Over seeds: percentiles of a stratified bootstrap ({bootstrap.resamples:,} resamples, "
+        f"seed {bootstrap.seed}), which draws runs with replacement within each task (Agarwal et al. 2021). Of a "
+        "single policy: Wilson's score interval over its episodes.",
         "Interquartile mean: mean of the middle half of all runs of all tasks. Performance profile: share of runs "
         "above a success rate. Probability of improvement: Mann-Whitney statistic over its largest value, averaged "
         "over tasks.",

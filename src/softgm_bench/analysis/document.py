@@ -1,11 +1,11 @@
 """What a report is made of, before it is Markdown, LaTeX or HTML: sections of paragraphs, tables and figures."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from itertools import groupby
+from typing import NamedTuple
 
 
-@dataclass(frozen=True)
-class Cell:
+class Cell(NamedTuple):
     """Text of a table's cell in Unicode; each format escapes it.
 
     Attributes:
@@ -19,20 +19,15 @@ class Cell:
     muted: bool = False
 
 
-MISSING = Cell("not run", muted=True)
-
-
-@dataclass(frozen=True)
-class Column:
-    """A table's column; columns next to each other with the same ``group`` share a heading above their own."""
+class Column(NamedTuple):
+    """A heading; columns next to each other with the same ``group`` share a heading above their own."""
 
     name: str
     group: str = ""
     numeric: bool = True
 
 
-@dataclass(frozen=True)
-class Table:
+class Table(NamedTuple):
     """``rows`` have one cell for each column; ``key`` names it in links and labels; ``notes`` stand below."""
 
     key: str
@@ -41,13 +36,13 @@ class Table:
     rows: Sequence[Sequence[Cell]]
     notes: Sequence[str] = ()
 
-    def __post_init__(self) -> None:
-        """Refuse rows that do not fit the columns."""
-        assert all(len(row) == len(self.columns) for row in self.rows), self.key
+    def groups(self) -> list[tuple[str, int]]:
+        """Headings above the columns' own and how many columns each spans; empty if no column has one."""
+        spans = [(group, len(list(members))) for group, members in groupby(column.group for column in self.columns)]
+        return spans if any(group for group, _ in spans) else []
 
 
-@dataclass(frozen=True)
-class Figure:
+class Figure(NamedTuple):
     """``key`` is also the name of its files; ``svg`` is the picture for a page, ``pdf`` for print."""
 
     key: str
@@ -59,17 +54,15 @@ class Figure:
 Block = str | Table | Figure
 
 
-@dataclass(frozen=True)
-class Section:
+class Section(NamedTuple):
     """A heading and what stands under it; a string is a paragraph."""
 
     title: str
-    blocks: Sequence[Block] = field(default_factory=list)
+    blocks: Sequence[Block]
 
 
-@dataclass(frozen=True)
-class Document:
-    """A report."""
+class Document(NamedTuple):
+    """A report's title and its sections."""
 
     title: str
     sections: Sequence[Section]
@@ -78,3 +71,9 @@ class Document:
     def figures(self) -> list[Figure]:
         """All figures in order."""
         return [block for section in self.sections for block in section.blocks if isinstance(block, Figure)]
+
+
+def written(blocks: Sequence[Block], *writers: Callable[..., str]) -> list[str]:
+    """Each block as one format's writers of a paragraph, a table and a figure, in this order, write its kind."""
+    kinds = dict(zip((str, Table, Figure), writers, strict=True))
+    return [kinds[type(block)](block) for block in blocks]

@@ -2,15 +2,14 @@
 
 import re
 from html import escape
-from itertools import groupby
 from pathlib import Path
 
-from softgm_bench.analysis.document import Block, Cell, Document, Figure, Section, Table
+from softgm_bench.analysis.document import Cell, Document, Figure, Section, Table, written
 from softgm_bench.analysis.style import GRID, INK, PAPER, SOFT
 
 
 def render(document: Document) -> str:
-    """The whole page."""
+    """Write the whole page."""
     css = Path(__file__).with_name("page.css").read_text()
     links = "".join(f'<a href="#{_anchor(section)}">{escape(section.title)}</a>' for section in document.sections)
     body = "\n".join(_section(section) for section in document.sections)
@@ -36,7 +35,7 @@ def render(document: Document) -> str:
 
 
 def _section(section: Section) -> str:
-    blocks = "\n".join(_block(block) for block in section.blocks)
+    blocks = "\n".join(written(section.blocks, _paragraph, _table, _figure))
     return f'<section>\n<h2 id="{_anchor(section)}">{escape(section.title)}</h2>\n{blocks}\n</section>'
 
 
@@ -44,36 +43,31 @@ def _anchor(section: Section) -> str:
     return re.sub(r"\W+", "-", section.title.lower()).strip("-")
 
 
-def _block(block: Block) -> str:
-    match block:
-        case Table():
-            return _table(block)
-        case Figure():
-            caption = f"<figcaption>{escape(block.caption)}</figcaption>"
-            return f'<figure class="picture" id="figure-{block.key}">\n{themed(block)}\n{caption}\n</figure>'
-        case _:
-            return f"<p>{escape(block)}</p>"
+def _paragraph(text: str) -> str:
+    return f"<p>{escape(text)}</p>"
+
+
+def _figure(figure: Figure) -> str:
+    caption = f"<figcaption>{escape(figure.caption)}</figcaption>"
+    return f'<figure class="picture" id="figure-{figure.key}">\n{themed(figure)}\n{caption}\n</figure>'
 
 
 def themed(figure: Figure) -> str:
-    """The figure's SVG for inside a page: text, lines and ground in the page's colours, names of the figure's own."""
+    """Prepare a figure's SVG for a page: text, lines and ground in the page's colours, names of the figure's own."""
     svg = figure.svg[figure.svg.index("<svg") :].strip()
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
     width = float(re.search(r'width="([0-9.]+)pt"', svg)[1])  # type: ignore[index]
     svg = re.sub(r' (width|height)="[0-9.]+pt"', "", svg, count=2)
     for name, colour in ((INK, "currentColor"), (SOFT, "var(--soft)"), (GRID, "var(--grid)"), (PAPER, "var(--card)")):
         svg = svg.replace(name, colour)
-    svg = re.sub(r'\bid="', f'id="{figure.key}-', svg)
-    svg = re.sub(r'href="#', f'href="#{figure.key}-', svg)
-    svg = svg.replace("url(#", f"url(#{figure.key}-")
+    svg = re.sub(r'(\bid="|href="#|url\(#)', rf"\g<1>{figure.key}-", svg)
     attributes = f'role="img" aria-label="{escape(figure.caption)}" style="max-width: {1.6 * width:.0f}px"'
     return svg.replace("<svg ", f"<svg {attributes} ", 1)
 
 
 def _table(table: Table) -> str:
-    rows = "\n".join(
-        "<tr>" + "".join(map(_cell, row, (column.numeric for column in table.columns))) + "</tr>" for row in table.rows
-    )
+    numeric = [column.numeric for column in table.columns]
+    rows = "\n".join(f"<tr>{''.join(map(_cell, row, numeric))}</tr>" for row in table.rows)
     notes = "".join(f'\n<p class="note">{escape(note)}</p>' for note in table.notes)
     return f"""<figure class="table" id="table-{table.key}">
 <figcaption>{escape(table.caption)}</figcaption>
@@ -92,13 +86,11 @@ def _table(table: Table) -> str:
 
 def _headings(table: Table) -> str:
     names = "".join(f"<th{_classes(numeric=column.numeric)}>{escape(column.name)}</th>" for column in table.columns)
-    if not any(column.group for column in table.columns):
-        return f"<tr>{names}</tr>"
     groups = ""
-    for group, members in groupby(table.columns, key=lambda column: column.group):
+    for group, width in table.groups():
         inner = f"<span>{escape(group)}</span>" if group else ""
-        groups += f'<th class="group" colspan="{len(list(members))}">{inner}</th>'
-    return f"<tr>{groups}</tr>\n<tr>{names}</tr>"
+        groups += f'<th class="group" colspan="{width}">{inner}</th>'
+    return f"<tr>{groups}</tr>\n<tr>{names}</tr>" if groups else f"<tr>{names}</tr>"
 
 
 def _cell(cell: Cell, numeric: bool) -> str:

@@ -1,10 +1,9 @@
 """A report as a LaTeX document of its own; tables use booktabs, figures are PDF files beside it."""
 
 import re
-from dataclasses import replace
-from itertools import groupby
+from collections.abc import Iterable
 
-from softgm_bench.analysis.document import Block, Cell, Document, Figure, Table
+from softgm_bench.analysis.document import Cell, Document, Figure, Table, written
 
 PREAMBLE = r"""\documentclass[a4paper,10pt]{article}
 \usepackage[landscape,margin=16mm]{geometry}
@@ -45,99 +44,71 @@ SYMBOLS = {
 
 
 def render(document: Document) -> str:
-    """The whole document."""
-    parts = [
-        PREAMBLE,
-        rf"\title{{{escape(document.title)}}}",
-        r"\author{}",
-        r"\date{}",
-        r"\begin{document}",
-        r"\maketitle",
-    ]
-    for section in document.sections:
-        parts += [rf"\section{{{escape(section.title)}}}", *(_block(block) for block in section.blocks)]
+    """Write the whole document."""
+    title = rf"\title{{{escape(document.title)}}}"
+    parts = [PREAMBLE, title, r"\author{}", r"\date{}", r"\begin{document}", r"\maketitle"]
+    for heading, blocks in document.sections:
+        parts += [rf"\section{{{escape(heading)}}}", *written(blocks, escape, _table, _figure)]
     return "\n\n".join([*parts, r"\end{document}"]) + "\n"
 
 
 def escape(text: str) -> str:
-    """Text with LaTeX's own and other special characters written as commands, and ``?`` for one that is not known."""
-    written = "".join(SYMBOLS.get(character, character) for character in text)
-    return "".join(character if character.isascii() else "?" for character in written)
-
-
-def _block(block: Block) -> str:
-    match block:
-        case Table():
-            return "\n\n".join(_table(part) for part in _pages(block))
-        case Figure():
-            return _figure(block)
-        case _:
-            return escape(block)
+    """Write LaTeX's own and other special characters as commands, and ``?`` for one that is not known."""
+    return "".join(SYMBOLS.get(character, character) for character in text).encode("ascii", "replace").decode()
 
 
 def _figure(figure: Figure) -> str:
     width = re.search(r'width="([0-9.]+)pt"', figure.svg)[1]  # type: ignore[index]
     width = rf"\ifdim {width}bp>\linewidth\linewidth\else {width}bp\fi"
-    lines = [
-        r"\begin{figure}[H]",
-        r"\centering",
-        rf"\includegraphics[width={width},height=0.8\textheight,keepaspectratio]{{figures/{figure.key}.pdf}}",
-        rf"\caption{{{escape(figure.caption)}}}",
-        rf"\label{{fig:{figure.key}}}",
-        r"\end{figure}",
-    ]
-    return "\n".join(lines)
+    picture = rf"\includegraphics[width={width},height=0.8\textheight,keepaspectratio]{{figures/{figure.key}.pdf}}"
+    return _float("figure", figure.caption, f"fig:{figure.key}", before=[picture])
 
 
-def _pages(table: Table) -> list[Table]:
-    """The table in parts that fit on a page; notes below the last, the label at the first."""
-    starts = range(0, max(1, len(table.rows)), ROWS_ON_A_PAGE)
-    parts = [
-        replace(
-            table,
-            key=f"{table.key}-{start}" if start else table.key,
-            caption=f"{table.caption} (continued)" if start else table.caption,
-            rows=table.rows[start : start + ROWS_ON_A_PAGE],
-            notes=[],
-        )
-        for start in starts
-    ]
-    return [*parts[:-1], replace(parts[-1], notes=table.notes)]
+def _float(kind: str, caption: str, label: str, before: Iterable[str] = (), after: Iterable[str] = ()) -> str:
+    """A figure or a table: what stands before and after its caption and label."""
+    named = [rf"\caption{{{escape(caption)}}}", rf"\label{{{label}}}"]
+    return "\n".join([rf"\begin{{{kind}}}[H]", r"\centering", *before, *named, *after, rf"\end{{{kind}}}"])
 
 
 def _table(table: Table) -> str:
-    alignment = "".join("r" if column.numeric else "l" for column in table.columns)
+    """The table in parts that fit on a page; notes below the last, the label at the first."""
+    starts = range(0, max(1, len(table.rows)), ROWS_ON_A_PAGE)
+    return "\n\n".join(_part(table, start) for start in starts)
+
+
+def _part(table: Table, start: int) -> str:
+    end = start + ROWS_ON_A_PAGE
+    notes = table.notes if end >= len(table.rows) else []
     lines = [
-        r"\begin{table}[H]",
-        r"\centering",
-        rf"\caption{{{escape(table.caption)}}}",
-        rf"\label{{tab:{table.key}}}",
         r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%",
-        rf"\begin{{tabular}}{{{alignment}}}",
+        rf"\begin{{tabular}}{{{''.join('r' if column.numeric else 'l' for column in table.columns)}}}",
         r"\toprule",
         *_headings(table),
         r"\midrule",
-        *(" & ".join(map(_cell, row)) + r" \\" for row in table.rows),
+        *(_row(map(_cell, row)) for row in table.rows[start:end]),
         r"\bottomrule",
         r"\end{tabular}}",
-        *(rf"\par\smallskip\parbox{{\linewidth}}{{\footnotesize {escape(note)}}}" for note in table.notes),
-        r"\end{table}",
+        *(rf"\par\smallskip\parbox{{\linewidth}}{{\footnotesize {escape(note)}}}" for note in notes),
     ]
-    return "\n".join(lines)
+    caption, label = table.caption, f"tab:{table.key}"
+    if start:
+        caption, label = f"{caption} (continued)", f"{label}-{start}"
+    return _float("table", caption, label, after=lines)
 
 
 def _headings(table: Table) -> list[str]:
-    names = " & ".join(escape(column.name) for column in table.columns) + r" \\"
-    if not any(column.group for column in table.columns):
-        return [names]
+    names = _row(escape(column.name) for column in table.columns)
     groups, rules, position = [], [], 1
-    for group, members in groupby(table.columns, key=lambda column: column.group):
-        width = len(list(members))
+    for group, width in table.groups():
         groups.append(rf"\multicolumn{{{width}}}{{c}}{{{escape(group)}}}")
         if group:
             rules.append(rf"\cmidrule(lr){{{position}-{position + width - 1}}}")
         position += width
-    return [" & ".join(groups) + r" \\", " ".join(rules), names]
+    return [_row(groups), " ".join(rules), names] if groups else [names]
+
+
+def _row(cells: Iterable[str]) -> str:
+    return " & ".join(cells) + r" \\"
 
 
 def _cell(cell: Cell) -> str:

@@ -1,10 +1,9 @@
 """The paper's Tables I and II; the figures stand in ``paper.yaml``."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from omegaconf import OmegaConf
 
@@ -17,8 +16,7 @@ ABLATIONS = ("softgm", "softgm_no_stage1", "softgm_no_stage2")
 MeanStd = tuple[float, float]
 
 
-@dataclass(frozen=True)
-class Row:
+class Row(NamedTuple):
     """Four columns of a table: means and standard deviations, None where the paper has a dash.
 
     Attributes:
@@ -36,22 +34,21 @@ class Row:
 
 @cache
 def _tables() -> Mapping[str, Mapping[str, Row]]:
-    values: Any = OmegaConf.to_container(OmegaConf.load(Path(__file__).with_name("paper.yaml")))
-    return {table: {name: _row(row) for name, row in rows.items()} for table, rows in values.items()}
+    tables: Any = OmegaConf.to_container(OmegaConf.load(Path(__file__).with_name("paper.yaml")))
+    return {name: {label: Row(**_pairs(row)) for label, row in rows.items()} for name, rows in tables.items()}
 
 
-def _row(row: Mapping[str, Any]) -> Row:
-    values: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in row.items()}
-    return Row(**values)
+def _pairs(row: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: tuple(value) if isinstance(value, list) else value for key, value in row.items()}
 
 
 def table_one(task: str, label: str) -> Row | None:
-    """What the paper reports for an algorithm on a task; None for what it does not have."""
+    """Look up the paper's result of an algorithm on a task; None for what it does not have."""
     return _tables().get(task, {}).get(label) if task in TASKS else None
 
 
 def table_two(task: str, label: str, perturbation: str) -> Row | None:
-    """What the paper reports under a perturbation; it has SoftGM on the wall only."""
+    """Look up the paper's result under a perturbation; it has SoftGM on the wall only."""
     if (task, label) != ("wall", "softgm"):
         return None
     return table_one(task, label) if perturbation == "none" else _tables()["robustness"].get(perturbation)

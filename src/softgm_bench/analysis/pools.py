@@ -1,13 +1,13 @@
 """Puts seeds together: all evaluations of one algorithm on one task, and which of them may be ranked."""
 
-import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from softgm_bench.analysis import paper
 from softgm_bench.analysis.runs import Evaluation, Run
-from softgm_bench.analysis.statistics import Array, mean_interval, pooled
+from softgm_bench.analysis.statistics import Array, Bootstrap, mean
 
 ORACLE, CURRICULUM, PERTURBED = "†", "‡", "§"
 MARKS = {
@@ -32,13 +32,8 @@ class Pool:
     ranked: bool = True
 
     @property
-    def task(self) -> str:
-        """Shared by all evaluations."""
-        return self.evaluations[0].task
-
-    @property
     def label(self) -> str:
-        """Shared by all evaluations."""
+        """The algorithm."""
         return self.evaluations[0].label
 
     @property
@@ -49,35 +44,40 @@ class Pool:
     @property
     def success_rates(self) -> Array | None:
         """A seed's share of successful episodes, ``(seeds,)``; None for a task without a notion of success."""
-        if any("success" not in evaluation.episodes for evaluation in self.evaluations):
+        success = self.column("success")
+        return None if success is None else np.array([of_seed.mean() for of_seed in success])
+
+    def column(self, name: str) -> list[Array] | None:
+        """A column of the episodes, one array a seed; None if it was not recorded for all."""
+        if any(name not in evaluation.episodes for evaluation in self.evaluations):
             return None
-        return np.array([evaluation.episodes["success"].mean() for evaluation in self.evaluations])
+        return [evaluation.episodes[name] for evaluation in self.evaluations]
 
-    @property
-    def diverged(self) -> int | None:
-        """Number of episodes in which the simulation broke."""
-        if any("diverged" not in evaluation.episodes for evaluation in self.evaluations):
+    def statistic(self, name: str) -> tuple[float, float] | None:
+        """Mean and population standard deviation over seeds x episodes; None if the column was not recorded."""
+        column = self.column(name)
+        if column is None:
             return None
-        return int(sum(evaluation.episodes["diverged"].sum() for evaluation in self.evaluations))
+        values = np.concatenate(column)
+        return float(values.mean()), float(values.std())
 
-    def statistic(self, column: str) -> tuple[float, float] | None:
-        """Mean and standard deviation over seeds x episodes; None if it was not recorded."""
-        if any(column not in evaluation.episodes for evaluation in self.evaluations):
-            return None
-        return pooled([evaluation.episodes[column] for evaluation in self.evaluations])
+    def success_interval(self, bootstrap: Bootstrap) -> tuple[float, float] | None:
+        """95 % interval of the mean success rate; None for a task without a notion of success.
 
-    def success_interval(self, resamples: int, seed: int) -> tuple[float, float] | None:
-        """95 % interval of the mean success rate.
-
-        Of several seeds, the bootstrap's over them; of one, Wilson's over its episodes, which says nothing about seeds.
+        It is the bootstrap's over several seeds; a single one has Wilson's over its episodes, which says nothing about
+        seeds.
         """
         rates = self.success_rates
         if rates is None:
             return None
         if self.seeds == 1:
             return wilson(self.evaluations[0])
-        low, high = mean_interval([rates], resamples, generator(seed, "success", self.task, self.label))
+        low, high = bootstrap.interval(f"success/{self.evaluations[0].task}/{self.label}", mean, [rates])
         return float(low), float(high)
+
+
+Pools = Mapping[tuple[str, str], Pool]
+Conditions = Mapping[tuple[str, str], Sequence[tuple[str, Pool | None]]]
 
 
 def wilson(evaluation: Evaluation) -> tuple[float, float]:
@@ -88,13 +88,8 @@ def wilson(evaluation: Evaluation) -> tuple[float, float]:
     return wilson_interval(int(success.sum()), len(success))
 
 
-def generator(seed: int, *names: str) -> np.random.Generator:
-    """Random numbers of one statistic: the same whatever else is in the report."""
-    return np.random.default_rng([seed, zlib.crc32("/".join(names).encode())])
-
-
 def newest(runs: Sequence[Run]) -> tuple[list[Run], list[tuple[Run, Run]]]:
-    """One run for each task, algorithm and seed: the one with the most frames.
+    """Choose one run for each task, algorithm and seed: the one with the most frames.
 
     Returns:
         Those runs, and pairs of a run that is left out for it and the run that takes its place.
@@ -102,50 +97,43 @@ def newest(runs: Sequence[Run]) -> tuple[list[Run], list[tuple[Run, Run]]]:
     best: dict[tuple, Run] = {}
     replaced: list[tuple[Run, Run]] = []
     for run in sorted(runs, key=lambda run: (-run.final.frames, run.final.folder)):
-        key = (run.final.task, run.final.label, run.final.seed)
-        if key in best:
-            replaced.append((run, best[key]))
-        best.setdefault(key, run)
+        kept = best.setdefault((run.final.task, run.final.label, run.final.seed), run)
+        if kept is not run:
+            replaced.append((run, kept))
     return sorted(best.values(), key=lambda run: run.final.folder), replaced
 
 
+def by_algorithm(runs: Sequence[Run]) -> dict[tuple[str, str], list[Run]]:
+    """Group runs by task and algorithm; each group keeps their order."""
+    groups: dict[tuple[str, str], list[Run]] = {}
+    for run in runs:
+        groups.setdefault((run.final.task, run.final.label), []).append(run)
+    return groups
+
+
 def pool_runs(runs: Sequence[Run]) -> dict[tuple[str, str], Pool]:
-    """Final evaluations by task and algorithm; algorithms that differ in kind have different names.
+    """Pool final evaluations by task and algorithm; algorithms that differ in kind have different names.
 
     Ranked are runs without the oracle and trained without perturbation. Where some were trained with a curriculum and
     others were not, those with it are not ranked.
     """
-    groups: dict[tuple[str, str], list[Run]] = {}
-    for run in sorted(runs, key=lambda run: (run.final.seed, run.final.folder)):
-        groups.setdefault((run.final.task, run.final.label), []).append(run)
-    competing: dict[str, list[bool]] = {}
-    for (task, _), members in groups.items():
-        competing.setdefault(task, []).extend(run.curriculum for run in members if not _apart(run))
-    return {
-        key: Pool(
-            tuple(run.final for run in members),
-            _marks(members),
-            not any(_apart(run) or (run.curriculum and not all(competing[key[0]])) for run in members),
-        )
-        for key, members in groups.items()
-    }
+    pools = {}
+    for key, members in by_algorithm(sorted(runs, key=lambda run: (run.final.seed, run.final.folder))).items():
+        kinds = set().union(*map(_kinds, members))
+        rivals = [_kinds(run) for run in runs if run.final.task == key[0]]
+        fair = all(CURRICULUM in rival for rival in rivals if not rival & {ORACLE, PERTURBED})
+        ranked = not kinds & {ORACLE, PERTURBED} and (CURRICULUM not in kinds or fair)
+        pools[key] = Pool(tuple(run.final for run in members), "".join(mark for mark in MARKS if mark in kinds), ranked)
+    return pools
 
 
-def _apart(run: Run) -> bool:
-    return run.oracle or run.trained_with != "none"
-
-
-def _marks(runs: Sequence[Run]) -> str:
-    kinds = {
-        ORACLE: any(run.oracle for run in runs),
-        CURRICULUM: any(run.curriculum for run in runs),
-        PERTURBED: any(run.trained_with != "none" for run in runs),
-    }
-    return "".join(mark for mark, there in kinds.items() if there)
+def _kinds(run: Run) -> set[str]:
+    there = {ORACLE: run.oracle, CURRICULUM: run.curriculum, PERTURBED: run.trained_with != "none"}
+    return {mark for mark, is_so in there.items() if is_so}
 
 
 def pool_evaluations(evaluations: Sequence[Evaluation]) -> dict[tuple[str, str, str], Pool]:
-    """Evaluations of the trained setting by task, algorithm and ``condition``.
+    """Pool evaluations of the trained setting by task, algorithm and ``condition``.
 
     Those with other settings than were trained with are left out. Of several with the same seed the one counts that is
     deterministic, has the longest time limit, the most frames, the most episodes, in this order; all seeds of a pool
@@ -167,11 +155,33 @@ def _preference(evaluation: Evaluation) -> tuple:
 
 
 def condition(evaluation: Evaluation) -> str:
-    """Perturbation and its parameters, e.g. ``noise (position 0.1)``."""
-    parameters = [
-        f"{name.replace('_', ' ')} {value}"
-        for name, value in evaluation.perturbation.items()
-        if name != "name" and value
-    ]
-    name = evaluation.perturbation["name"]
+    """Name a perturbation and its parameters, e.g. ``noise (position 0.1)``."""
+    settings = dict(evaluation.perturbation)
+    name = settings.pop("name")
+    parameters = [f"{key.replace('_', ' ')} {value}" for key, value in settings.items() if value]
     return f"{name} ({', '.join(parameters)})" if parameters else name
+
+
+def by_condition(nominal: Pools, perturbed: Mapping[tuple[str, str, str], Pool]) -> Conditions:
+    """Order what was evaluated, and the paper's SoftGM on the wall in any case, by task and algorithm.
+
+    Each has the nominal condition, the paper's three and others, with its pool or None; a name with several parameters
+    keeps them.
+    """
+    subjects = sorted({(task, label) for task, label, _ in perturbed} | {("wall", "softgm")}, key=_order)
+    rows: dict[tuple[str, str], list[tuple[str, Pool | None]]] = {subject: [] for subject in subjects}
+    for subject in subjects:
+        there = {full: pool for (*key, full), pool in perturbed.items() if tuple(key) == subject}
+        others = sorted({full.split(" ")[0] for full in there} - {"none", *paper.PERTURBATIONS})
+        for name in ("none", *paper.PERTURBATIONS, *others):
+            full_names = [full for full in there if full.split(" ")[0] == name]
+            rows[subject] += [(name if len(full_names) == 1 else full, there[full]) for full in full_names]
+            if not full_names:
+                rows[subject].append((name, nominal.get(subject) if name == "none" else None))
+    return rows
+
+
+def _order(subject: tuple[str, str]) -> tuple:
+    task, label = subject
+    position = paper.TASKS.index(task) if task in paper.TASKS else len(paper.TASKS)
+    return position, task, label != "softgm", label

@@ -9,9 +9,9 @@ import csv
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,9 +50,9 @@ class Evaluation:
     frames: int
     episodes: Columns
     deterministic: bool
-    horizon: int | None = None
-    perturbation: Mapping[str, Any] = field(default_factory=lambda: {"name": "none"})
-    overrides: Sequence[str] = ()
+    horizon: int | None
+    perturbation: Mapping[str, Any]
+    overrides: Sequence[str]
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,130 +92,109 @@ class Run:
         return self.config["experiment"]["evaluation"]["horizon"] or self.config["task"]["horizon"]
 
 
-@dataclass(frozen=True)
-class Problem:
+class Problem(NamedTuple):
     """A folder that looks like a run or an evaluation and cannot be used."""
 
     folder: str
     reason: str
 
 
-@dataclass(frozen=True, eq=False)
-class Found:
-    """What lies below a folder, each sorted by folder."""
+class Found(NamedTuple):
+    """Everything usable below some folders, and what is not, in the order of the folders' names."""
 
-    runs: list[Run] = field(default_factory=list)
-    evaluations: list[Evaluation] = field(default_factory=list)
-    problems: list[Problem] = field(default_factory=list)
-
-    def __add__(self, other: "Found") -> "Found":
-        """Both together."""
-        return Found(self.runs + other.runs, self.evaluations + other.evaluations, self.problems + other.problems)
+    runs: list[Run]
+    evaluations: list[Evaluation]
+    problems: list[Problem]
 
 
-def find(root: Path) -> Found:
-    """Everything below ``root``.
+def find(*roots: Path) -> Found:
+    """Read everything below the folders.
 
     Raises:
         UserError: there is no such folder.
     """
-    if not root.is_dir():
-        raise UserError(f"{root}: no such folder")
-    found, base = Found(), root.resolve().parent
-    for path, folders, files in os.walk(root.resolve()):
-        folders[:] = sorted(name for name in folders if name != "checkpoints")
-        if not {"summary.json", "config.yaml", "metrics.csv", "episodes.csv"} & set(files):
-            continue
-        folder, name = RunFolder(Path(path)), Path(path).relative_to(base).as_posix()
-        try:
-            source = _read(folder, name)
-        except _Unusable as unusable:
-            found.problems.append(Problem(name, str(unusable)))
-        else:
-            (found.runs if isinstance(source, Run) else found.evaluations).append(source)  # type: ignore[arg-type]
+    found = Found([], [], [])
+    lists: dict[type, list] = {Run: found.runs, Evaluation: found.evaluations, Problem: found.problems}
+    for root in roots:
+        if not root.is_dir():
+            raise UserError(f"{root}: no such folder")
+        for path, folders, files in os.walk(root.resolve()):
+            folders[:] = sorted(name for name in folders if name != "checkpoints")
+            if {"summary.json", "config.yaml", "metrics.csv", "episodes.csv"} & set(files):
+                source = _read(RunFolder(Path(path)), Path(path).relative_to(root.resolve().parent).as_posix())
+                lists[type(source)].append(source)
     return found
 
 
-class _Unusable(Exception):
-    """Why a folder is left out."""
-
-
-def _read(folder: RunFolder, name: str) -> Run | Evaluation:
+def _read(folder: RunFolder, name: str) -> Run | Evaluation | Problem:
     if not folder.summary.exists():
-        raise _Unusable(_how_far(folder))
+        return Problem(name, f"unfinished: summary.json is missing{_how_far(folder)}")
     try:
-        summary = json.loads(folder.summary.read_text())
-        episodes = _columns(folder.episodes)
-        if "final_evaluation" not in summary and "perturbation" in summary:
-            return _evaluation(name, summary, episodes)
-        _compare(episodes, summary["final_evaluation"])
-        return _run(folder, name, summary, episodes)
+        return _source(folder, name)
     except FileNotFoundError as error:
-        raise _Unusable(f"damaged: {Path(error.filename).name} is missing") from error
+        reason = f"{Path(error.filename).name} is missing"
     except (KeyError, TypeError, AttributeError) as error:
-        raise _Unusable(f"damaged: a file lacks an entry ({error})") from error
+        reason = f"a file lacks an entry ({error})"
     except (ValueError, OSError, YAMLError, OmegaConfBaseException) as error:
-        raise _Unusable(f"damaged: {str(error).splitlines()[0]}") from error
+        reason = str(error).splitlines()[0]
+    return Problem(name, f"damaged: {reason}")
 
 
 def _how_far(folder: RunFolder) -> str:
-    """What is known of a run that has no summary."""
+    """How far a run came that has no summary, as far as it is known."""
     try:
         frames = max(int(row["frames"]) for row in csv.DictReader(folder.metrics.open()))
     except (OSError, KeyError, ValueError, TypeError):
-        return "unfinished: summary.json is missing"
-    return f"unfinished: summary.json is missing; {frames:,} frames so far"
+        return ""
+    return f"; {frames:,} frames so far"
 
 
-def _run(folder: RunFolder, name: str, summary: Mapping[str, Any], episodes: Columns) -> Run:
-    config: Any = OmegaConf.to_container(OmegaConf.create(folder.config.read_text()))
-    if not isinstance(config, dict):
-        raise ValueError("config.yaml holds no settings")
-    settings, horizon = config["experiment"]["evaluation"], config["task"]["horizon"]
-    final = Evaluation(
-        **_who_acted(name, summary),
+def _source(folder: RunFolder, name: str) -> Run | Evaluation:
+    summary = json.loads(folder.summary.read_text())
+    episodes = _columns(folder.episodes)
+    trained = "final_evaluation" in summary or "perturbation" not in summary
+    _compare(episodes, summary["final_evaluation" if trained else "metrics"])
+    config: Any = OmegaConf.to_container(OmegaConf.load(folder.config)) if trained else None
+    perturbation = summary.get("perturbation", "none")
+    evaluation = Evaluation(
+        folder=name,
+        task=summary["task"],
+        label=summary["algo"],
+        seed=summary["seed"],
+        frames=summary["frames"],
         episodes=episodes,
-        horizon=settings["final_horizon"] or horizon,
-    )
-    # a run that is shorter than the interval of its evaluations has no such file
-    lines = folder.evaluations.read_text().splitlines() if folder.evaluations.exists() else []
-    progress = [json.loads(line) for line in lines]
-    for entry in progress:
-        if {"frames", "discounted_return", "episode_length"} - entry.keys():
-            raise ValueError("a line of evaluations.jsonl lacks an entry")
-    return Run(final, summary, config, progress)
-
-
-def _evaluation(name: str, summary: Mapping[str, Any], episodes: Columns) -> Evaluation:
-    _compare(episodes, summary["metrics"])
-    perturbation = summary["perturbation"]
-    return Evaluation(
-        **_who_acted(name, summary),
-        episodes=episodes,
-        horizon=summary.get("horizon") or _horizon(episodes),
+        deterministic=summary["deterministic"],
+        horizon=_final_horizon(config) if trained else summary.get("horizon") or _longest_failure(episodes),
         perturbation={"name": perturbation} if isinstance(perturbation, str) else perturbation,
         overrides=tuple(one for one in summary.get("overrides", ()) if not one.startswith("perturbation")),
     )
+    return Run(evaluation, summary, config, _progress(folder)) if trained else evaluation
 
 
-def _who_acted(name: str, summary: Mapping[str, Any]) -> dict[str, Any]:
-    """What the summaries of a run and of an evaluation say alike."""
-    same = {field: summary[field] for field in ("task", "seed", "frames", "deterministic")}
-    return {"folder": name, "label": summary["algo"], **same}
+def _final_horizon(config: Mapping[str, Any]) -> int:
+    return config["experiment"]["evaluation"]["final_horizon"] or config["task"]["horizon"]
 
 
-def _horizon(episodes: Columns) -> int | None:
+def _longest_failure(episodes: Columns) -> int | None:
     """Length of an episode that ended with neither success nor divergence: only the time limit ends it so."""
     timed_out = (episodes["success"] == 0) & (episodes["diverged"] == 0)
     return int(episodes["length"][timed_out].max()) if timed_out.any() else None
 
 
+def _progress(folder: RunFolder) -> list[Mapping[str, Any]]:
+    if not folder.evaluations.exists():  # the run is shorter than the interval of its evaluations
+        return []
+    progress = [json.loads(line) for line in folder.evaluations.read_text().splitlines()]
+    if any({"frames", "discounted_return", "episode_length"} - entry.keys() for entry in progress):
+        raise ValueError("a line of evaluations.jsonl lacks an entry")
+    return progress
+
+
 def _columns(path: Path) -> Columns:
-    with path.open(newline="") as file:
-        rows = list(csv.reader(file))
-    if len(rows) < 2 or any(len(row) != len(rows[0]) for row in rows):
+    rows = list(csv.reader(path.read_text().splitlines()))
+    if len(rows) < 2 or len({len(row) for row in rows}) > 1:
         raise ValueError(f"{path.name} is empty or has an incomplete row")
-    values = [[TRUTH[text] if text in TRUTH else float(text) for text in row] for row in rows[1:]]
+    values = [[float(TRUTH.get(text, text)) for text in row] for row in rows[1:]]
     return dict(zip(rows[0], np.array(values).T, strict=True))
 
 

@@ -43,25 +43,18 @@ SETTINGS: dict[str, Any] = {
     "ytick.labelcolor": INK,
     "axes.grid": True,
     "grid.color": GRID,
-    "grid.linewidth": 0.8,
     "axes.axisbelow": True,
     "axes.spines.top": False,
     "axes.spines.right": False,
-    "axes.linewidth": 0.8,
-    "font.family": "DejaVu Sans",
     "font.size": 9,
     "axes.titlesize": 10,
     "axes.titleweight": "bold",
     "axes.titlelocation": "left",
-    "axes.labelsize": 9,
     "legend.frameon": False,
     "legend.fontsize": 8.5,
-    "lines.linewidth": 1.8,
     "lines.solid_capstyle": "round",
-    "svg.fonttype": "path",
     "svg.hashsalt": "softgm_bench",
     "pdf.compression": 0,
-    "pdf.fonttype": 3,
 }
 
 
@@ -71,7 +64,7 @@ def colour(label: str) -> str:
 
 
 def line(label: str) -> dict[str, Any]:
-    """Settings of an algorithm's line."""
+    """Give matplotlib's settings of an algorithm's line."""
     return {
         "color": colour(label),
         "linestyle": (0, (4, 1.6)) if label in DASHED else "-",
@@ -82,13 +75,13 @@ def line(label: str) -> dict[str, Any]:
 
 @contextmanager
 def look() -> Iterator[None]:
-    """Draw and ``save`` inside: nothing of a reader's own matplotlib settings matters."""
+    """Make nothing of a reader's own matplotlib settings matter inside, or in a function that it decorates."""
     with matplotlib.style.context(["default", SETTINGS]):
         yield
 
 
 def save(canvas: Canvas) -> tuple[str, bytes]:
-    """SVG and PDF of a figure, without dates."""
+    """Write a figure as SVG and PDF, without dates."""
     svg, pdf = io.StringIO(), io.BytesIO()
     canvas.savefig(svg, format="svg", metadata={"Date": None})
     canvas.savefig(pdf, format="pdf", metadata={"CreationDate": None})

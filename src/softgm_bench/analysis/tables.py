@@ -1,219 +1,159 @@
-"""The report's tables: ours beside the paper's; what was not run says so."""
+"""The report's tables: ours beside the paper's, statistics over tasks, and every source; what was not run says so."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+
+from scipy.stats import rankdata
 
 from softgm_bench.analysis import names, paper
-from softgm_bench.analysis.document import MISSING, Cell, Column, Table
-from softgm_bench.analysis.pools import MARKS, Pool, condition
-from softgm_bench.analysis.robustness import Perturbed, conditions_of, subjects
+from softgm_bench.analysis.aggregate import Aggregate, Comparison, Estimate
+from softgm_bench.analysis.document import Cell, Column, Table
+from softgm_bench.analysis.pools import MARKS, Conditions, Pool, Pools, condition, wilson
+from softgm_bench.analysis.runs import Evaluation, Problem, Run
+from softgm_bench.analysis.statistics import Bootstrap
 
-Pools = Mapping[tuple[str, str], Pool]
-DASH = Cell("—", muted=True)
-NONE = Cell("")
-
-
-@dataclass(frozen=True)
-class Measure:
-    """A column of the paper's tables: ours, theirs, and how many digits each has."""
-
-    heading: str
-    ours: str
-    theirs: str
-    digits: int
-    their_digits: int
+Row = list[Cell | str]  # a plain cell may be its text
+NOT_RUN, NOT_RECORDED, ONE_SEED, DASH = (Cell(text, muted=True) for text in ("not run", "not recorded", "1 seed", "—"))
 
 
+def _texts(*headings: str) -> list[Column]:
+    return [Column(heading, numeric=False) for heading in headings]
+
+
+def _numbers(*headings: str, group: str = "") -> list[Column]:
+    return [Column(heading, group) for heading in headings]
+
+
+def _table(key: str, caption: str, columns: Sequence[Column], rows: Sequence[Row], notes: Sequence[str] = ()) -> Table:
+    assert all(len(row) == len(columns) for row in rows), key
+    cells = [[Cell(cell) if isinstance(cell, str) else cell for cell in row] for row in rows]
+    return Table(key, caption, columns, cells, notes)
+
+
+# Heading of a measure, its column of the episodes and its digits, the paper's name for it and the paper's digits.
 MEASURES = (
-    Measure("Episode length", "episode_length", "episode_length", 1, 1),
-    Measure("Tip travel, m", "tip_travel_distance", "tip_travel_distance", 2, 4),
-    Measure("Torque, all agents, N m", "torque_joint", "torque", 2, 2),
+    ("Episode length", "length", 1, "episode_length", 1),
+    ("Tip travel, m", "tip_travel_distance", 2, "tip_travel_distance", 4),
+    ("Torque, all agents, N m", "torque_joint", 2, "torque", 2),
 )
-COLUMN_OF = {"episode_length": "length"}
+BESIDE_THE_PAPER = [
+    *_numbers("ours", "95 % interval", "paper", group="Success, %"),
+    *(column for heading, *_ in MEASURES for column in _numbers("ours", "paper", group=heading)),
+    *_numbers("Torque per agent, N m"),
+]
 
 
-@dataclass(frozen=True)
-class Drawing:
-    """How intervals over seeds are drawn."""
+def _beside_the_paper(pool: Pool | None, theirs: paper.Row | None, bootstrap: Bootstrap, best: bool = False) -> Row:
+    row = _success(pool, bootstrap, best)
+    row.append(Cell(f"{theirs.success_rate:.2f}", muted=True) if theirs else "")
+    for _, column, digits, attribute, their_digits in MEASURES:
+        values = getattr(theirs, attribute) if theirs else None
+        dash = DASH if theirs else ""
+        row += [_spread(pool, column, digits), Cell(names.spread(values, their_digits), muted=True) if values else dash]
+    return [*row, _spread(pool, "torque_per_agent", 2)]
 
-    resamples: int
-    seed: int
+
+def _success(pool: Pool | None, bootstrap: Bootstrap, best: bool = False) -> Row:
+    if pool is None:
+        return [NOT_RUN, ""]
+    rates, interval = pool.success_rates, pool.success_interval(bootstrap)
+    if rates is None or interval is None:
+        return [NOT_RECORDED, ""]
+    bounds = names.percent_interval(interval) + (" (1 seed)" if pool.seeds == 1 else "")
+    return [Cell(names.percent(rates.mean()), strong=best), bounds]
 
 
-def table_one(task: str, pools: Pools, labels: Sequence[str], drawing: Drawing) -> Table:
-    """The paper's Table I for one task, and other algorithms that were run on it, below."""
-    known = task in paper.TASKS
-    columns = [
-        Column("Algorithm", numeric=False),
-        Column("seeds × episodes"),
-        Column("rank"),
-        *_grouped("Success, %", ["ours", "95 % interval", *(["paper"] if known else [])]),
-    ]
-    for measure in MEASURES:
-        columns += _grouped(measure.heading, ["ours", *(["paper"] if known else [])])
-    columns += [Column("Torque per agent, N m")]
-    ranks = success_ranks(task, pools, labels)
-    rows = [_row_one(task, label, pools.get((task, label)), ranks, known, drawing) for label in labels]
-    there = [pool for label in labels if (pool := pools.get((task, label)))]
-    number = f"Table I, {names.task(task)}." if known else f"{names.task(task)} (not in the paper)."
+def _spread(pool: Pool | None, column: str, digits: int) -> Cell | str:
+    if pool is None:
+        return NOT_RUN
+    values = pool.statistic(column)
+    return names.spread(values, digits) if values else NOT_RECORDED
+
+
+def table_one(task: str, pools: Pools, labels: Sequence[str], bootstrap: Bootstrap) -> Table:
+    """Put the paper's Table I of one task beside ours, and other algorithms that were run on it below."""
+    ranks = _success_ranks(task, pools, labels)
+    columns = [*_texts("Algorithm"), *_numbers("seeds × episodes", "rank"), *BESIDE_THE_PAPER]
+    rows: list[Row] = []
+    for label in labels:
+        pool, rank = pools.get((task, label)), ranks.get(label)
+        results = _beside_the_paper(pool, paper.table_one(task, label), bootstrap, best=rank == 1)
+        rows.append([_name(label, pool), _size(pool), _rank(pool, rank), *results])
+    number = f"Table I, {names.task(task)}."
+    if task not in paper.TASKS:
+        number = f"{names.task(task)} (not in the paper)."
+        rows = [[cell for cell, column in zip(row, columns, strict=True) if column.name != "paper"] for row in rows]
+        columns = [column for column in columns if column.name != "paper"]
+    there = [pools[task, label] for label in labels if (task, label) in pools]
     caption = f"{number} Mean ± standard deviation over seeds × episodes. {_protocol(there)}"
-    return Table(f"one-{task}", caption, columns, rows, _notes(there))
+    return _table(f"one-{task}", caption, columns, rows, _notes(there))
 
 
-def _row_one(
-    task: str, label: str, pool: Pool | None, ranks: Mapping[str, int], known: bool, drawing: Drawing
-) -> list[Cell]:
-    theirs = paper.table_one(task, label)
-    best = ranks.get(label) == 1
-    name = names.algorithm(label) + (pool.marks if pool else "")
-    row = [Cell(name), _size(pool), _rank(pool, ranks.get(label))]
-    row += _success(pool, best, drawing)
-    if known:
-        row.append(_paper_success(theirs))
-    for measure in MEASURES:
-        row.append(_ours(pool, measure))
-        if known:
-            row.append(_theirs(theirs, measure))
-    row.append(_number(pool, names.spread(pool.statistic("torque_per_agent") if pool else None, 2)))
-    return row
-
-
-def success_ranks(task: str, pools: Pools, labels: Sequence[str]) -> dict[str, int]:
+def _success_ranks(task: str, pools: Pools, labels: Sequence[str]) -> dict[str, int]:
     """Rank by success rate of those that compete, if there are two or more; equal rates share a rank."""
-    rates = {
-        label: float(pool.success_rates.mean())
-        for label in labels
-        if (pool := pools.get((task, label))) and pool.ranked and pool.success_rates is not None
-    }
+    ranked = {label: pools[task, label] for label in labels if (task, label) in pools and pools[task, label].ranked}
+    rates = {label: pool.success_rates.mean() for label, pool in ranked.items() if pool.success_rates is not None}
     if len(rates) < 2:
         return {}
-    return {label: 1 + sum(other > rate for other in rates.values()) for label, rate in rates.items()}
+    ranks = rankdata([-rate for rate in rates.values()], method="min")
+    return dict(zip(rates, map(int, ranks), strict=True))
 
 
-def table_two(nominal: Pools, perturbed: Perturbed, drawing: Drawing) -> Table:
-    """The paper's Table II, and every other task, algorithm and condition that was evaluated."""
-    columns = [
-        Column("Task", numeric=False),
-        Column("Algorithm", numeric=False),
-        Column("Condition", numeric=False),
-        Column("seeds × episodes"),
-        *_grouped("Success, %", ["ours", "95 % interval", "paper"]),
-    ]
-    for measure in MEASURES:
-        columns += _grouped(measure.heading, ["ours", "paper"])
-    columns += [Column("Torque per agent, N m")]
-    rows, there, conditions = [], [], set()
-    for task, label in subjects(perturbed):
-        marks = nominal[task, label].marks if (task, label) in nominal else ""
-        for name, pool in conditions_of(task, label, nominal, perturbed):
-            theirs = paper.table_two(task, label, name)
-            rows.append(
-                [
-                    Cell(task),
-                    Cell(names.algorithm(label) + marks),
-                    Cell(names.perturbation(name)),
-                    _size(pool),
-                    *_success(pool, False, drawing),
-                    _paper_success(theirs),
-                    *(cell for measure in MEASURES for cell in (_ours(pool, measure), _theirs(theirs, measure))),
-                    _number(pool, names.spread(pool.statistic("torque_per_agent") if pool else None, 2)),
-                ]
-            )
-            if pool:
-                there.append(pool)
-                conditions |= {condition(evaluation) for evaluation in pool.evaluations} - {"none"}
-    caption = f"Table II, robustness. Mean ± standard deviation over seeds × episodes. {_protocol(there)}"
-    notes = [f"Conditions: {'; '.join(map(names.perturbation, sorted(conditions)))}."] if conditions else []
-    return Table("two", caption, columns, rows, [*notes, *_notes(there)])
-
-
-def ablations(pools: Pools, drawing: Drawing) -> Table:
-    """SoftGM with and without each of its stages, on every task."""
-    columns = [Column("Task", numeric=False), Column("Model", numeric=False), *_run_columns()]
-    rows, there = [], []
-    for task in paper.TASKS:
-        full = pools.get((task, "softgm"))
-        for label in paper.ABLATIONS:
-            pool = pools.get((task, label))
-            rows.append(
-                [
-                    Cell(names.task(task)),
-                    Cell(names.algorithm(label) + (pool.marks if pool else "")),
-                    _size(pool),
-                    *_success(pool, False, drawing),
-                    _difference(pool, full) if label != "softgm" else DASH,
-                    _ours(pool, MEASURES[0]),
-                ]
-            )
-            there += [pool] if pool else []
-    caption = f"Ablations: SoftGM without stage 1 (entity to agent) or stage 2 (agent to agent). {_protocol(there)}"
-    return Table("ablations", caption, columns, rows, _notes(there))
-
-
-def _run_columns() -> list[Column]:
-    return [
-        Column("seeds × episodes"),
-        *_grouped("Success, %", ["mean", "95 % interval", "against full"]),
-        Column("Episode length"),
-    ]
-
-
-def _difference(pool: Pool | None, full: Pool | None) -> Cell:
-    """In percentage points."""
-    if pool is None or full is None or pool.success_rates is None or full.success_rates is None:
-        return MISSING
-    return Cell(f"{100 * (pool.success_rates.mean() - full.success_rates.mean()):+.1f}".replace("-", "−"))
-
-
-def _grouped(group: str, members: Sequence[str]) -> list[Column]:
-    return [Column(member, group) for member in members]
-
-
-def _size(pool: Pool | None) -> Cell:
-    """Seeds x episodes."""
+def _rank(pool: Pool | None, rank: int | None) -> Cell | str:
     if pool is None:
-        return MISSING
-    return Cell(f"{pool.seeds} × {names.span([len(evaluation.episodes['length']) for evaluation in pool.evaluations])}")
-
-
-def _rank(pool: Pool | None, rank: int | None) -> Cell:
-    if pool is None:
-        return NONE
+        return ""
     if rank is None:
         return DASH if pool.ranked else Cell("not ranked", muted=True)
-    return Cell(str(rank))
+    return str(rank)
 
 
-def _success(pool: Pool | None, best: bool, drawing: Drawing) -> list[Cell]:
+def table_two(nominal: Pools, conditions: Conditions, bootstrap: Bootstrap) -> Table:
+    """Put the paper's Table II beside every task, algorithm and condition that was evaluated."""
+    columns = [*_texts("Task", "Algorithm", "Condition"), *_numbers("seeds × episodes"), *BESIDE_THE_PAPER]
+    rows: list[Row] = []
+    for (task, label), pools in conditions.items():
+        name = _name(label, nominal.get((task, label)))
+        for perturbation, pool in pools:
+            results = _beside_the_paper(pool, paper.table_two(task, label, perturbation), bootstrap)
+            rows.append([task, name, names.perturbation(perturbation), _size(pool), *results])
+    there = [pool for pools in conditions.values() for _, pool in pools if pool]
+    caption = f"Table II, robustness. Mean ± standard deviation over seeds × episodes. {_protocol(there)}"
+    found = {condition(evaluation) for pool in there for evaluation in pool.evaluations} - {"none"}
+    notes = [f"Conditions: {'; '.join(map(names.perturbation, sorted(found)))}."] if found else []
+    return _table("two", caption, columns, rows, [*notes, *_notes(there)])
+
+
+def ablations(pools: Pools, bootstrap: Bootstrap) -> Table:
+    """Compare SoftGM with and without each of its stages, on every task."""
+    success = _numbers("mean", "95 % interval", "against full", group="Success, %")
+    columns = [*_texts("Task", "Model"), *_numbers("seeds × episodes"), *success, *_numbers("Episode length")]
+    keys = [(task, label) for task in paper.TASKS for label in paper.ABLATIONS]
+    rows: list[Row] = []
+    for task, label in keys:
+        pool = pools.get((task, label))
+        difference = _difference(pool, pools.get((task, "softgm"))) if label != "softgm" else DASH
+        results = [*_success(pool, bootstrap), difference, _spread(pool, "length", 1)]
+        rows.append([names.task(task), _name(label, pool), _size(pool), *results])
+    there = [pools[key] for key in keys if key in pools]
+    caption = f"Ablations: SoftGM without stage 1 (entity to agent) or stage 2 (agent to agent). {_protocol(there)}"
+    return _table("ablations", caption, columns, rows, _notes(there))
+
+
+def _difference(pool: Pool | None, full: Pool | None) -> Cell | str:
+    """In percentage points."""
+    if pool is None or full is None or pool.success_rates is None or full.success_rates is None:
+        return NOT_RUN
+    return f"{100 * (pool.success_rates.mean() - full.success_rates.mean()):+.1f}".replace("-", "−")
+
+
+def _name(label: str, pool: Pool | None) -> str:
+    return names.algorithm(label) + (pool.marks if pool else "")
+
+
+def _size(pool: Pool | None) -> Cell | str:
+    """Seeds x episodes."""
     if pool is None:
-        return [MISSING, NONE]
-    rates, interval = pool.success_rates, pool.success_interval(drawing.resamples, drawing.seed)
-    if rates is None or interval is None:
-        return [Cell("not recorded", muted=True), NONE]
-    bounds = names.percent_interval(interval) + (" (1 seed)" if pool.seeds == 1 else "")
-    return [Cell(names.percent(float(rates.mean())), strong=best), Cell(bounds)]
-
-
-def _ours(pool: Pool | None, measure: Measure) -> Cell:
-    column = COLUMN_OF.get(measure.ours, measure.ours)
-    return _number(pool, names.spread(pool.statistic(column) if pool else None, measure.digits))
-
-
-def _number(pool: Pool | None, text: str | None) -> Cell:
-    if pool is None:
-        return MISSING
-    return Cell("not recorded", muted=True) if text is None else Cell(text)
-
-
-def _theirs(row: paper.Row | None, measure: Measure) -> Cell:
-    if row is None:
-        return NONE
-    text = names.spread(getattr(row, measure.theirs), measure.their_digits)
-    return DASH if text is None else Cell(text, muted=True)
-
-
-def _paper_success(row: paper.Row | None) -> Cell:
-    return NONE if row is None else Cell(f"{row.success_rate:.2f}", muted=True)
+        return NOT_RUN
+    return f"{pool.seeds} × {names.span([len(evaluation.episodes['length']) for evaluation in pool.evaluations])}"
 
 
 def _protocol(pools: Sequence[Pool]) -> str:
@@ -222,30 +162,117 @@ def _protocol(pools: Sequence[Pool]) -> str:
     if not evaluations:
         return "Nothing was run."
     frames = names.span([evaluation.frames for evaluation in evaluations], 1e6, 2)
-    horizons = sorted({evaluation.horizon for evaluation in evaluations if evaluation.horizon is not None})
-    kinds = sorted({"deterministic" if evaluation.deterministic else "sampled" for evaluation in evaluations})
+    horizons = [evaluation.horizon for evaluation in evaluations if evaluation.horizon is not None]
     limit = f"at most {names.span(horizons)} control steps" if horizons else "time limit not recorded"
-    return f"Trained with {frames} million frames; {limit}, {' and '.join(kinds)} actions."
+    return f"Trained with {frames} million frames; {limit}, {names.actions(evaluations)} actions."
 
 
 def _notes(pools: Sequence[Pool]) -> list[str]:
-    used = {mark for pool in pools for mark in pool.marks}
-    notes = [f"{mark} {text}." for mark, text in MARKS.items() if mark in used]
+    """Explain marks and intervals; say how many episodes the simulation broke, which count as failures."""
+    notes = [f"{mark} {text}." for mark, text in MARKS.items() if any(mark in pool.marks for pool in pools)]
     if any(pool.seeds == 1 for pool in pools):
         notes.append(
             "1 seed: the interval is Wilson's over the episodes of the one policy; it holds nothing about seeds."
         )
-    return [*notes, *_diverged(pools)]
-
-
-def _diverged(pools: Sequence[Pool]) -> list[str]:
-    """How many episodes ended because the simulation broke; they count as failures."""
-    counted = [(pool, pool.diverged) for pool in pools if pool.diverged is not None]
-    if not counted:
-        return []
+    recorded = [(pool, diverged) for pool in pools if (diverged := pool.column("diverged"))]
     broken = [
-        f"{names.algorithm(pool.label)} {count:,} of {sum(len(one.episodes['length']) for one in pool.evaluations):,}"
-        for pool, count in counted
-        if count
+        f"{names.algorithm(pool.label)} {count:,} of {sum(map(len, diverged)):,}"
+        for pool, diverged in recorded
+        if (count := int(sum(of_seed.sum() for of_seed in diverged)))
     ]
-    return [f"Episodes that diverged, counted as failures: {', '.join(broken) if broken else 'none'}."]
+    if recorded:
+        notes.append(f"Episodes that diverged, counted as failures: {', '.join(broken) or 'none'}.")
+    return notes
+
+
+def aggregates(entries: Sequence[Aggregate]) -> Table:
+    """Show interquartile mean and mean success over the tasks."""
+    success = _numbers("IQM", "95 % interval", "mean", "95 % interval", group="Success over all tasks, %")
+    columns = [*_texts("Algorithm"), *_numbers("seeds per task"), *success, *_texts("not run, or not ranked, on")]
+    rows: list[Row] = []
+    for entry in entries:
+        missing = Cell(", ".join(map(names.task, entry.missing)), muted=True)
+        estimates = [*_estimate(entry.iqm), *_estimate(entry.mean)]
+        rows.append([names.algorithm(entry.label), ", ".join(map(str, entry.seeds)), *estimates, missing])
+    absent = [names.algorithm(label) for label in paper.ALGORITHMS if label not in {entry.label for entry in entries}]
+    notes = [f"Not run on any task: {', '.join(absent)}."] if absent else []
+    caption = (
+        "Success over the paper's three tasks: interquartile mean (IQM) and mean, with stratified bootstrap intervals "
+        "over seeds. A single seed gives none; a task that is missing leaves both out."
+    )
+    return _table("aggregates", caption, columns, rows, notes)
+
+
+def _estimate(estimate: Estimate | None) -> Row:
+    if estimate is None:
+        return [NOT_RUN, ""]
+    bounds = ONE_SEED if estimate.interval is None else names.percent_interval(estimate.interval)
+    return [names.percent(estimate.value), bounds]
+
+
+def comparisons(pairs: Sequence[Comparison]) -> Table:
+    """Show the probability of improvement of each pair."""
+    results = _numbers("seeds, at least", "P(higher success)", "95 % interval")
+    rows: list[Row] = []
+    for first, second, tasks, seeds, (value, interval) in pairs:
+        bounds = ONE_SEED if interval is None else f"[{interval[0]:.2f}, {interval[1]:.2f}]"
+        subjects = [names.algorithm(first), names.algorithm(second), ", ".join(map(names.task, tasks))]
+        rows.append([*subjects, f"{seeds[0]} and {seeds[1]}", f"{value:.2f}", bounds])
+    caption = (
+        "Probability of improvement: how often a run of the first algorithm has a higher success rate than a run of "
+        "the second, a tie counting one half, averaged over the tasks both have."
+    )
+    return _table("improvement", caption, [*_texts("Algorithm", "against", "tasks"), *results], rows)
+
+
+SOURCE = [*_texts("Task", "Algorithm"), *_numbers("seed")]
+RESULT = [
+    *_numbers("episodes"),
+    *_numbers("mean", "95 % interval", group="Success, %"),
+    *_numbers("Episode length", "diverged"),
+]
+
+
+def sources(runs: Sequence[Run]) -> Table:
+    """List every run, with Wilson's interval of its success rate."""
+    columns = [*SOURCE, *_numbers("frames", "minutes"), *RESULT, *_numbers("time limit"), *_texts("source")]
+    rows: list[Row] = []
+    for run in runs:
+        amounts = [f"{run.final.frames:,}", f"{run.summary['wall_time'] / 60:.0f}"]
+        limit, folder = f"{run.final.horizon:,}", Cell(run.final.folder, muted=True)
+        rows.append([*_source(run.final), *amounts, *_result(run.final), limit, folder])
+    caption = "Every run that the tables and figures hold, with Wilson's 95 % interval over its episodes."
+    return _table("sources", caption, columns, rows)
+
+
+def evaluation_sources(evaluations: Sequence[Evaluation]) -> Table:
+    """List every evaluation beside training, whatever its settings."""
+    columns = [*SOURCE, *_texts("Condition", "other settings"), *RESULT, *_texts("source")]
+    rows: list[Row] = []
+    for one in evaluations:
+        settings = [names.perturbation(condition(one)), " ".join(one.overrides)]
+        rows.append([*_source(one), *settings, *_result(one), Cell(one.folder, muted=True)])
+    caption = "Every evaluation beside training, with Wilson's 95 % interval over its episodes."
+    return _table("evaluations", caption, columns, rows)
+
+
+def _source(evaluation: Evaluation) -> Row:
+    return [names.task(evaluation.task), evaluation.label, str(evaluation.seed)]
+
+
+def _result(evaluation: Evaluation) -> Row:
+    episodes = evaluation.episodes
+    success: Row = [NOT_RECORDED, ""]
+    if "success" in episodes:
+        success = [names.percent(episodes["success"].mean()), names.percent_interval(wilson(evaluation))]
+    diverged = str(int(episodes["diverged"].sum())) if "diverged" in episodes else "not recorded"
+    return [str(len(episodes["length"])), *success, _spread(Pool((evaluation,)), "length", 1), diverged]
+
+
+def left_out(problems: Sequence[Problem], replaced: Sequence[tuple[Run, Run]]) -> Table:
+    """List what lies in the folder and is in no table, and why."""
+    rows: list[Row] = [[problem.folder, problem.reason] for problem in problems]
+    for old, new in replaced:
+        why = f"same task, algorithm and seed as {new.final.folder}, which has as many frames or more"
+        rows.append([old.final.folder, why])
+    return _table("left-out", "Found, and in no table or figure.", _texts("folder", "why"), rows)
