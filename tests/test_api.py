@@ -9,8 +9,8 @@ import torch
 from torchrl.envs.utils import step_mdp
 
 from softgm_bench import api
-from softgm_bench.config import UserError
 from softgm_bench.envs import entries
+from softgm_bench.errors import UserError
 
 ROOT = Path(__file__).parents[1]
 TINY = (

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 import pytest
 
 from softgm_bench import command
-from softgm_bench.config import UserError
+from softgm_bench.errors import UserError
 
 
 @dataclass

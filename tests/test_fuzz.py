@@ -9,9 +9,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from softgm_bench.assembly import configure
-from softgm_bench.config import UserError
 from softgm_bench.config.explain import USER_ERRORS, explain
 from softgm_bench.episodes import policy, trajectory
+from softgm_bench.errors import UserError
 from softgm_bench.runs import checkpoint
 
 POLICIES = Path(__file__).parents[1] / "experiments" / "policies"

@@ -10,7 +10,7 @@ import pytest
 
 from made_up_runs import write_run
 from softgm_bench import status
-from softgm_bench.config import UserError
+from softgm_bench.errors import UserError
 from softgm_bench.sweeps import record as sweep_record
 
 HOLD = """

@@ -12,8 +12,9 @@ from hydra._internal.utils import get_args_parser
 from omegaconf import DictConfig
 
 from softgm_bench import process
-from softgm_bench.config import UserError, composing, config_directory, typed
+from softgm_bench.config import composing, config_directory, typed
 from softgm_bench.config.explain import USER_ERRORS, explain
+from softgm_bench.errors import UserError
 from softgm_bench.sweeps import cell as sweep_cell
 from softgm_bench.sweeps import launch as sweep
 
@@ -107,10 +108,10 @@ def _sweep(arguments: Any) -> int:
     except Exception as error:  # a launcher's, such as a worker of its own that was killed
         line = str(error).strip().partition("\n")[0]
         print(f"softgm_bench: the launcher stopped, {type(error).__name__}: {line}", file=sys.stderr)
-        print("softgm_bench: the same command goes on with what is not done", file=sys.stderr)
+        print("softgm_bench: the same command resumes what is not done", file=sys.stderr)
         return 2
     except KeyboardInterrupt as interruption:
-        interruption.args = ("interrupted; the same command goes on with what is not done",)
+        interruption.args = ("interrupted; the same command resumes what is not done",)
         interruption.exit_code = 128 + (received or signal.SIGINT)  # type: ignore[attr-defined]
         raise
     return 0 if outcomes.all_well else 2

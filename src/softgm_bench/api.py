@@ -1,4 +1,4 @@
-"""What the commands do, from Python. ``overrides`` are settings as on the command line: ``"task=wall"``, ``"seed=1"``.
+"""The commands as Python functions. ``overrides`` are settings as on the command line: ``"task=wall"``, ``"seed=1"``.
 
 Everything raises ``UserError`` with one line about what is wrong; Hydra and OmegaConf raise their own for settings that
 cannot be read. Loading this module takes seconds, for torch.
@@ -22,8 +22,9 @@ from softgm_bench.config import Config
 from softgm_bench.envs import entries
 from softgm_bench.episodes import folder as evaluation_folder
 from softgm_bench.episodes import policy, recording
-from softgm_bench.episodes.evaluation import DISCOUNT, EpisodeRecords, evaluate_in_parts
+from softgm_bench.episodes.evaluation import DISCOUNT, EpisodeRecords
 from softgm_bench.episodes.policy import TrainedPolicy
+from softgm_bench.episodes.protocol import Protocol
 from softgm_bench.episodes.summary import summarise, table
 from softgm_bench.episodes.trajectory import Trajectory
 from softgm_bench.errors import UserError
@@ -154,28 +155,14 @@ def evaluate(
         batch: environments at once, to save memory; None: all. Others play other episodes.
         out: folder for ``episodes.csv`` and ``summary.json``; None: nothing is written.
     """
+    protocol = Protocol(episodes, seed, deterministic, horizon, gamma, batch)
+    protocol.check()
     trained = _loaded(source, overrides)
     if out is not None:
         evaluation_folder.check(Path(out), overwrite=False)
-    records = evaluate_in_parts(
-        trained.policy,
-        lambda count, own: build_env(trained.config, count, own, horizon),
-        episodes,
-        deterministic=deterministic,
-        seed=seed,
-        gamma=gamma,
-        at_once=batch,
-    )
+    records = protocol.play(trained)
     if out is not None:
-        settings = {
-            "evaluation_seed": seed,
-            "deterministic": deterministic,
-            "horizon": horizon or trained.config.task.horizon,
-            "batch": batch,
-            "discount": gamma,
-            "threads": torch.get_num_threads(),
-            "overrides": list(overrides),
-        }
+        settings = protocol.describe(trained, overrides)
         evaluation_folder.write(Path(out), records, evaluation_folder.describe(trained, records, settings))
     return Evaluation(records, summarise(records))
 

@@ -23,7 +23,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from softgm_bench import command
-from softgm_bench.config import UserError, available_threads
+from softgm_bench.config import available_threads
+from softgm_bench.errors import UserError
 
 if TYPE_CHECKING:
     from softgm_bench.episodes.trajectory import Trajectory

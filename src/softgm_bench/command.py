@@ -1,4 +1,4 @@
-"""What the commands beside training share: ``SOURCE key=value ...``, and one line for what a user can put right."""
+"""Shared by the commands beside training: ``SOURCE key=value ...``, and one line for what a user can put right."""
 
 import difflib
 import os
@@ -13,8 +13,9 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from softgm_bench import process
-from softgm_bench.config import CHANGEABLE, UserError
+from softgm_bench.config import CHANGEABLE
 from softgm_bench.config.explain import USER_ERRORS, explain
+from softgm_bench.errors import UserError
 
 Options = TypeVar("Options")
 

@@ -28,19 +28,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from softgm_bench import command
-from softgm_bench.config import UserError, available_threads
+from softgm_bench.config import available_threads
+from softgm_bench.episodes.protocol import Protocol
+from softgm_bench.errors import UserError
 
 
 @dataclass
-class Options:
+class Options(Protocol):
     """The command's own settings; meanings above."""
 
-    episodes: int = 100
-    seed: int = 0
-    deterministic: bool = True
-    horizon: int | None = None
-    gamma: float = 0.99
-    batch: int | None = None
     threads: int | None = None
     device: str = "cpu"
     out: str | None = None
@@ -52,14 +48,7 @@ class Options:
         Raises:
             UserError: naming the first such setting, its value and what would be right.
         """
-        for key in ("episodes", "horizon", "batch"):
-            value = getattr(self, key)
-            if value is not None and value < 1:
-                raise UserError(f"{key}={value}: it must be at least 1")
-        if not 0 <= self.seed < 2**63:
-            raise UserError(f"seed={self.seed}: a seed is a whole number from 0 to 2**63 - 1")
-        if not 0.0 <= self.gamma <= 1.0:
-            raise UserError(f"gamma={self.gamma}: it must lie between 0 and 1")
+        super().check()
         if self.threads is not None and not 1 <= self.threads <= available_threads():
             raise UserError(f"threads={self.threads}: choose 1 to {available_threads()}, the cores here, or null")
         if self.out == "":
@@ -77,10 +66,8 @@ def _evaluate(arguments: list[str]) -> None:
     )
     options.check()
     # late: a refused command need not wait for torch
-    from softgm_bench.assembly import build_env
     from softgm_bench.episodes import folder as evaluation_folder
     from softgm_bench.episodes import policy
-    from softgm_bench.episodes.evaluation import evaluate_in_parts
     from softgm_bench.episodes.summary import table
     from softgm_bench.runs.machine import keep_memory, set_threads
 
@@ -88,29 +75,12 @@ def _evaluate(arguments: list[str]) -> None:
     unusual = {"horizon": options.horizon, "sampled": not options.deterministic}
     folder = Path(options.out or evaluation_folder.default_folder(source, trained, overrides, options.seed, unusual))
     evaluation_folder.check(folder, options.overwrite)
-    threads = set_threads(options.threads)
+    set_threads(options.threads)
     keep_memory()
     began = time.perf_counter()
-    records = evaluate_in_parts(
-        trained.policy,
-        lambda count, seed: build_env(trained.config, count, seed, options.horizon),
-        options.episodes,
-        deterministic=options.deterministic,
-        seed=options.seed,
-        gamma=options.gamma,
-        at_once=options.batch,
-    )
+    records = options.play(trained)
     seconds = time.perf_counter() - began
-    settings = {
-        "evaluation_seed": options.seed,
-        "deterministic": options.deterministic,
-        "horizon": options.horizon or trained.config.task.horizon,
-        "batch": options.batch,
-        "discount": options.gamma,
-        "threads": threads,
-        "overrides": overrides,
-    }
-    summary = evaluation_folder.describe(trained, records, settings)
+    summary = evaluation_folder.describe(trained, records, options.describe(trained, overrides))
     under = trained.config.perturbation.name
     title = f"{trained.label} on {summary['task']}, perturbation {under}, seed {options.seed}:"
     print(table(summary["metrics"], title), flush=True)  # before anything is written: a full disk leaves it

@@ -1,28 +1,30 @@
-"""Keep a trained policy as one small file: ``python -m softgm_bench.export RUN_FOLDER_OR_CHECKPOINT FILE``."""
+"""Keep a trained policy as one small file: ``python -m softgm_bench.export SOURCE FILE``.
 
-import argparse
+SOURCE is a run folder, whose newest checkpoint is taken, or a checkpoint. FILE is written, or replaced.
+"""
+
 import sys
 from pathlib import Path
 
-from softgm_bench.config import UserError
+from softgm_bench import command
+from softgm_bench.errors import UserError
 
 
 def main() -> int:
-    """0, or 2 after one line about what is wrong."""
-    parser = argparse.ArgumentParser(prog="python -m softgm_bench.export", description=__doc__)
-    parser.add_argument("source", type=Path, help="run folder, whose newest checkpoint is taken, or checkpoint")
-    parser.add_argument("file", type=Path, help="to be written or replaced")
-    arguments = parser.parse_args()
-    from softgm_bench.episodes import policy  # late: help need not wait for torch
+    """Run what the command line says; 0, or 2 after one line about what is wrong."""
+    return command.run("export", __doc__, _export)
 
-    try:
-        trained = policy.load(arguments.source)
-        policy.save(trained, arguments.file)
-    except UserError as error:
-        print(f"softgm_bench.export: {error}", file=sys.stderr)
-        return 2
-    print(f"{trained.config.label} on {trained.config.task.name} after {trained.frames} frames: {arguments.file}")
-    return 0
+
+def _export(arguments: list[str]) -> None:
+    if len(arguments) != 2 or any(argument.startswith("-") for argument in arguments):
+        found = ", ".join(arguments) or "nothing"
+        raise UserError(f"found {found}: give a run folder or checkpoint, and the file to write")
+    source, file = map(Path, arguments)
+    from softgm_bench.episodes import policy  # late: a refused command need not wait for torch
+
+    trained = policy.load(source)
+    policy.save(trained, file)
+    print(f"{trained.config.label} on {trained.config.task.name} after {trained.frames} frames: {file}")
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from softgm_bench.command import parse, run
-from softgm_bench.config import UserError
+from softgm_bench.errors import UserError
 from softgm_bench.storage.files import to_json, write_atomically
 
 

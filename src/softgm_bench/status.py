@@ -1,11 +1,11 @@
-"""What has become of a sweep: ``python -m softgm_bench.status FOLDER key=value ...``.
+"""Show what has become of a sweep: ``python -m softgm_bench.status FOLDER key=value ...``.
 
 FOLDER is where runs lie, such as outputs or outputs/full. Settings, with their defaults:
 
   grid=null   name of a grid in conf/grids: its cells only, in its order, those that are missing too
 
 One line a run: done (success rate with its 95 % interval), running (process, frames), failed (why), stopped (it was
-killed or interrupted; the sweep's command goes on with it), missing.
+killed or interrupted; the sweep's command resumes it), missing.
 """
 
 import os
@@ -16,7 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from softgm_bench import command
-from softgm_bench.config import UserError, config_directory
+from softgm_bench.config import config_directory
+from softgm_bench.errors import UserError
 
 
 @dataclass

@@ -9,9 +9,9 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 from softgm_bench.adapters.gymnasium_vector import SoftArmGymnasiumEnv, SoftArmVectorEnv, register
-from softgm_bench.config import UserError
 from softgm_bench.envs import entries, make_env
 from softgm_bench.envs.tasks import TASKS
+from softgm_bench.errors import UserError
 
 ENVS = 5
 QUICK = "rod.substeps=10"  # a tenth of a control step: these tests are about the adapter

@@ -11,8 +11,8 @@ from pettingzoo.test import parallel_api_test, parallel_seed_test
 from torchrl.envs import PettingZooWrapper, check_env_specs
 
 from softgm_bench.adapters.pettingzoo import parallel_env
-from softgm_bench.config import UserError
 from softgm_bench.envs import entries, make_env
+from softgm_bench.errors import UserError
 from softgm_bench.models.graph import flat_features, flat_observation
 
 QUICK = "rod.substeps=10"  # a tenth of a control step: these tests are about the adapter

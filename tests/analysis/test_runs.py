@@ -4,7 +4,7 @@ import pytest
 
 from made_up_runs import write_evaluation, write_run
 from softgm_bench.analysis.runs import find
-from softgm_bench.config import UserError
+from softgm_bench.errors import UserError
 
 
 def test_a_run_is_read_with_its_episodes_and_the_evaluations_on_its_way(tmp_path):

@@ -2,7 +2,8 @@ import pytest
 from refused import refusal
 
 from softgm_bench.assembly import configure
-from softgm_bench.config import UserError, compose, validate
+from softgm_bench.config import compose, validate
+from softgm_bench.errors import UserError
 
 
 def test_mistakes_in_perturbations_are_one_line():

@@ -7,7 +7,8 @@ from refused import refusal
 from softgm_bench import plugins
 from softgm_bench.algorithms import algorithm_configs
 from softgm_bench.assembly import build_env
-from softgm_bench.config import UserError, changed, compose, compose_untyped, config_directory, plain, typed
+from softgm_bench.config import changed, compose, compose_untyped, config_directory, plain, typed
+from softgm_bench.errors import UserError
 from softgm_bench.rod.numba_backend import NumbaBackend
 from softgm_bench.rod.parameters import RodParameters
 

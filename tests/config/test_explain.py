@@ -3,8 +3,8 @@ from omegaconf.errors import OmegaConfBaseException
 from refused import refusal
 
 from softgm_bench.algorithms import algorithm_configs
-from softgm_bench.config import UserError
 from softgm_bench.config.explain import USER_ERRORS
+from softgm_bench.errors import UserError
 
 
 def test_keys_that_nobody_reads_are_refused_wherever_they_are_written():

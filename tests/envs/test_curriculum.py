@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 
 from dense import force_dense
 from softgm_bench.assembly import configure
-from softgm_bench.config import UserError
 from softgm_bench.envs.curriculum import difficulty, first_progress, note_ends
 from softgm_bench.envs.tasks import make_task
 from softgm_bench.envs.tasks.base import CurriculumConfig, eased
+from softgm_bench.errors import UserError
 
 TASKS = ("basic", "structured", "wall", "wall_narrow", "wall_fixed")
 ENABLED = "task.curriculum.enabled=true"

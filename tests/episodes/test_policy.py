@@ -5,9 +5,10 @@ import pytest
 import torch
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from softgm_bench.config import UserError, compose
+from softgm_bench.config import compose
 from softgm_bench.envs import entries, make_env
 from softgm_bench.episodes import policy
+from softgm_bench.errors import UserError
 from softgm_bench.runs import checkpoint
 from softgm_bench.runs.loop import train
 from softgm_bench.storage.run_folder import RunFolder

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from recorded import WALL, recorded
 
-from softgm_bench.config import UserError
 from softgm_bench.episodes import trajectory
 from softgm_bench.episodes.replay import compare, replay
+from softgm_bench.errors import UserError
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

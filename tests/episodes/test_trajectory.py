@@ -8,10 +8,10 @@ import pytest
 from recorded import SEEN, WALL, leaning, recorded, untrained, watched
 
 from softgm_bench.assembly import build_env
-from softgm_bench.config import UserError
 from softgm_bench.envs import entries
 from softgm_bench.episodes import recording, trajectory
 from softgm_bench.episodes.evaluation import evaluate_in_parts, evaluation_seed
+from softgm_bench.errors import UserError
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 EPISODES = 3

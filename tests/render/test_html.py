@@ -14,8 +14,9 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from softgm_bench.config import UserError, compose, plain
+from softgm_bench.config import compose, plain
 from softgm_bench.episodes.trajectory import Trajectory
+from softgm_bench.errors import UserError
 from softgm_bench.render.camera import direction
 from softgm_bench.render.html import ATTENTION_BYTES, SCRIPTS, VIEWER, payload, render_page, write_html
 from softgm_bench.rod.parameters import RodParameters

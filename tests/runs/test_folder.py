@@ -1,6 +1,6 @@
 import pytest
 
-from softgm_bench.config import UserError
+from softgm_bench.errors import UserError
 from softgm_bench.runs import folder as run_folder
 
 CONFIG = {"seed": 0}

@@ -7,7 +7,8 @@ import numba
 import pytest
 import torch
 
-from softgm_bench.config import UserError, compose
+from softgm_bench.config import compose
+from softgm_bench.errors import UserError
 from softgm_bench.runs import checkpoint
 from softgm_bench.runs.loop import train
 from softgm_bench.runs.machine import set_threads

@@ -1,4 +1,4 @@
-"""A run that is broken off anywhere and gone on with is the run that was not."""
+"""A run that is interrupted anywhere and resumed is the run that was not."""
 
 import fcntl
 import json
@@ -15,7 +15,8 @@ import pytest
 import torch
 from interrupted import PPO, SMALL, TINY, differences, start, state, written
 
-from softgm_bench.config import UserError, compose
+from softgm_bench.config import compose
+from softgm_bench.errors import UserError
 from softgm_bench.runs import checkpoint, loop
 from softgm_bench.runs.interruption import Interrupted
 from softgm_bench.runs.metrics import CsvWriter
@@ -93,7 +94,7 @@ def lines(capsys):
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """Folder of a run of SMALL that was never broken off: 10 iterations, evaluations after 3, 6 and 9."""
+    """Folder of a run of SMALL that was never interrupted: 10 iterations, evaluations after 3, 6 and 9."""
     folder = tmp_path_factory.mktemp("whole")
     train(folder, *SMALL)
     return folder
@@ -174,7 +175,7 @@ def test_an_evaluation_that_a_signal_broke_off_is_made_up_for(tmp_path, whole, m
 
     with monkeypatch.context() as patch:
         patch.setattr(loop, "_evaluate", interrupted)
-        with pytest.raises(Interrupted, match="after 48 frames, resume=true goes on"):
+        with pytest.raises(Interrupted, match="after 48 frames, resume=true resumes it"):
             train(tmp_path, *SMALL)
     train(tmp_path, *SMALL, "resume=true")
 
@@ -239,7 +240,7 @@ def test_a_damaged_checkpoint_is_passed_over_in_one_line(broken, whole, capsys):
 
     said = lines(capsys)
     assert said[0].startswith(f"passed over {newest}: damaged")
-    assert said[1] == f"{broken}: going on after 64 frames"
+    assert said[1] == f"{broken}: resuming after 64 frames"
     assert written(broken) == written(whole)
 
 
@@ -270,7 +271,7 @@ def test_without_a_checkpoint_it_begins_anew_and_says_so(tmp_path, whole, capsys
 
     train(tmp_path / "run", *SMALL, "resume=true")
 
-    assert lines(capsys)[0] == f"{tmp_path / 'run'}: no checkpoint to go on from, the run begins anew"
+    assert lines(capsys)[0] == f"{tmp_path / 'run'}: no checkpoint to resume from, the run begins anew"
     assert written(tmp_path / "run") == written(whole)
 
 
@@ -289,7 +290,7 @@ def test_a_checkpoint_of_another_version_is_refused_in_one_line(broken):
     del held["environment"]["shown"]
     torch.save(held, newest)
 
-    with pytest.raises(UserError, match=r"^[^\n]*: this version cannot go on from its checkpoint; [^\n]*$"):
+    with pytest.raises(UserError, match=r"^[^\n]*: this version cannot resume from its checkpoint; [^\n]*$"):
         train(broken, *SMALL, "resume=true")
 
 
@@ -327,8 +328,8 @@ def test_a_run_whose_disk_was_full_goes_on_where_there_is_room_again(tmp_path, w
     assert said[-2:] == ["disk/run: finished already", "2 0 0"]
     errors = [line for line in result.stderr.splitlines() if line.startswith(("softgm_bench:", "disk/run:"))]
     assert errors == [
-        "softgm_bench: disk/run: No space left on device; earlier checkpoints are whole, resume=true goes on",
-        "disk/run: going on after 64 frames",
+        "softgm_bench: disk/run: No space left on device; earlier checkpoints are whole, resume=true resumes it",
+        "disk/run: resuming after 64 frames",
     ]
     assert written(tmp_path / "copy") == written(whole)
 

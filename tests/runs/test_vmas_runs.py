@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from softgm_bench.assembly import configure
-from softgm_bench.config import UserError
+from softgm_bench.errors import UserError
 from softgm_bench.runs.loop import train
 
 SMALL = (

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from softgm_bench.config import UserError
+from softgm_bench.errors import UserError
 from softgm_bench.storage import archive
 
 

@@ -6,7 +6,8 @@ from itertools import product
 import pytest
 from omegaconf import OmegaConf
 
-from softgm_bench.config import UserError, config_directory
+from softgm_bench.config import config_directory
+from softgm_bench.errors import UserError
 from softgm_bench.sweeps import cell as sweep_cell
 from softgm_bench.sweeps import launch as sweep
 

@@ -19,10 +19,10 @@ from tensordict import TensorDictBase
 
 from softgm_bench import plugins
 from softgm_bench.assembly import build_env, configure
-from softgm_bench.config import UserError
 from softgm_bench.envs import entries
 from softgm_bench.envs.soft_arm import SoftArmEnv
 from softgm_bench.envs.tasks import TASKS
+from softgm_bench.errors import UserError
 
 Array = NDArray[Any]
 SETTINGS = ("task", "rod", "perturbation", "device", "backend", "dtype")  # what an environment alone depends on

@@ -1,4 +1,4 @@
-"""What DDPG and SAC share: replay, exploration, and how many gradient steps follow a batch of frames."""
+"""Shared by DDPG and SAC: replay buffer, exploration, and how many gradient steps follow a batch of frames."""
 
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar
@@ -10,9 +10,9 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.objectives import LossModule, ValueEstimators
 
-from softgm_bench.algorithms.replay import Replay
+from softgm_bench.algorithms.replay_buffer import ReplayBuffer
 from softgm_bench.algorithms.team import give_to_agents
-from softgm_bench.algorithms.vector_replay import VectorReplay
+from softgm_bench.algorithms.vector_replay_buffer import VectorReplayBuffer
 from softgm_bench.envs import entries
 from softgm_bench.envs.interface import VECTOR, Environment
 from softgm_bench.models.action_value import ActionValueConfig
@@ -198,7 +198,7 @@ class OffPolicy:
         return transitions
 
     def state_dict(self) -> dict[str, Any]:
-        """Networks, target networks, optimisers, counters, and the replay if ``checkpoint_replay`` says so."""
+        """Networks, target networks, optimisers, counters, and the replay buffer if ``checkpoint_replay`` says so."""
         state = {
             "loss": self.loss.state_dict(),
             "optimizers": {name: optimizer.state_dict() for name, optimizer in self.optimizers.items()},
@@ -208,9 +208,9 @@ class OffPolicy:
         return state | ({"replay": self.replay.state_dict()} if self.config.checkpoint_replay else {})
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from what ``state_dict`` returned.
+        """Resume from what ``state_dict`` returned.
 
-        Without the replay, gradient steps pause until as many frames are stored again as before the very first one.
+        Without the replay buffer, gradient steps pause until as many frames are stored again as before the first one.
         """
         self.loss.load_state_dict(state["loss"])
         for name, optimizer in self.optimizers.items():
@@ -255,12 +255,12 @@ class OffPolicy:
         return torch.stack([*(value.detach() for value in self._metrics(losses)), *norms])
 
     def _metrics(self, losses: TensorDictBase) -> list[Tensor]:
-        """What ``reported`` names, from what the loss returned."""
+        """Give what ``reported`` names, from what the loss returned."""
         raise NotImplementedError
 
 
-def _make_replay(capacity: int, env: Environment, n_privileged: int) -> Replay | VectorReplay:
+def _make_replay(capacity: int, env: Environment, n_privileged: int) -> ReplayBuffer | VectorReplayBuffer:
     """Take the memory that fits the layout of the environment's observations."""
     if env.sizes.layout == VECTOR:
-        return VectorReplay(capacity, env.device)
-    return Replay(capacity, env.batch_size[0], env.sizes, env.device, n_privileged)
+        return VectorReplayBuffer(capacity, env.device)
+    return ReplayBuffer(capacity, env.batch_size[0], env.sizes, env.device, n_privileged)

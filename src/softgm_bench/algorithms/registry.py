@@ -1,4 +1,4 @@
-"""Which algorithm a configuration means: one table, filled by ``register_algorithm``."""
+"""The table of algorithms, filled by ``register_algorithm``: which one a configuration means."""
 
 from collections.abc import Callable
 from typing import Any, Protocol, TypeVar
@@ -10,7 +10,7 @@ from softgm_bench.envs.interface import Environment, Sizes
 
 
 class Algorithm(Protocol):
-    """What the experiment's loop knows of an algorithm.
+    """The interface of an algorithm for the loop of a run.
 
     Attributes:
         policy: reads ``entries.OBSERVATION`` (and ``entries.PRIVILEGED`` as an oracle), writes ``entries.ACTION``;
@@ -33,10 +33,10 @@ class Algorithm(Protocol):
         """
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that going on needs: tensors and plain Python values."""
+        """Give everything that resuming needs: tensors and plain Python values."""
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from what ``state_dict`` returned."""
+        """Resume from what ``state_dict`` returned."""
 
 
 AlgorithmClass = TypeVar("AlgorithmClass", bound=type)

@@ -1,4 +1,4 @@
-"""What belongs to the team, given to each of its agents: here and nowhere else."""
+"""The team's reward and ends, given to each of its agents: here and nowhere else."""
 
 from torch import Tensor
 

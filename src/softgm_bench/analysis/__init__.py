@@ -1,1 +1,1 @@
-"""What is read from runs: statistics, tables, figures, attention."""
+"""Reading of finished runs: statistics, tables, figures, attention."""

@@ -1,4 +1,4 @@
-"""Where SoftGM looks: attention matrices of an episode's steps, and what they do along the episode (paper, Fig. 4).
+"""SoftGM's attention: matrices of an episode's steps, and what they do along the episode (paper, Fig. 4).
 
 A matrix has a row for each agent that listens and a column for each node that it listens to; a row sums to one. Cells
 without an edge are left pale: their weight is zero by construction. Places on a canvas are in inches from its lower
@@ -149,7 +149,7 @@ def _colour_bar(canvas: Canvas, image: ScalarMappable, highest: float, *place: f
 
 
 def _allowed(trajectory: Trajectory, step: int, stage: str) -> NDArray[np.bool_]:
-    """Which cells have an edge: ``(N, N + M)`` of stage 1, ``(N, N)`` of stage 2."""
+    """Mark the cells that have an edge: ``(N, N + M)`` of stage 1, ``(N, N)`` of stage 2."""
     n = trajectory.n_agents
     if stage == "stage1":
         return np.concatenate([np.eye(n, dtype=bool), trajectory.observation["agents/edge"][step]], axis=1)

@@ -1,4 +1,4 @@
-"""What a report is made of, before it is Markdown, LaTeX or HTML: sections of paragraphs, tables and figures."""
+"""A report before it is Markdown, LaTeX or HTML: sections of paragraphs, tables and figures."""
 
 from collections.abc import Callable, Sequence
 from itertools import groupby

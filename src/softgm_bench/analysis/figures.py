@@ -46,7 +46,7 @@ def learning_curves(
     for row, measure in zip(panels, measures, strict=True):
         for axes, task in zip(row, tasks, strict=True):
             for label in labels:
-                _draw_curve(axes, curve(runs.get((task, label), ()), measure), label)
+                draw_curve(axes, curve(runs.get((task, label), ()), measure), label)
             axes.margins(x=0.02)
             axes.xaxis.set_major_locator(MaxNLocator(5))
             axes.xaxis.set_major_formatter(FuncFormatter(lambda frames, _: f"{frames / 1e6:g}"))
@@ -88,7 +88,8 @@ def curve(runs: Sequence[Run], measure: str) -> tuple[Array, Array] | None:
     return grid, np.stack([np.interp(grid, at, of_run) for at, of_run in zip(frames, values, strict=True)])
 
 
-def _draw_curve(axes: Axes, drawn: tuple[Array, Array] | None, label: str) -> None:
+def draw_curve(axes: Axes, drawn: tuple[Array, Array] | None, label: str) -> None:
+    """Draw what ``curve`` gave: the mean, and around it the standard error of several seeds, each of them thin."""
     if drawn is None:
         return
     (frames, seeds), look = drawn, style.line(label)

@@ -19,7 +19,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from softgm_bench.config import UserError
+from softgm_bench.errors import UserError
 from softgm_bench.storage.run_folder import RunFolder
 
 Columns = Mapping[str, NDArray[np.float64]]
@@ -73,12 +73,12 @@ class Run:
 
     @property
     def oracle(self) -> bool:
-        """Whether actors were told what they would have to discover."""
+        """Tell whether actors were told what they would have to discover."""
         return self.summary["observation"] == "oracle"
 
     @property
     def curriculum(self) -> bool:
-        """Whether training began with easier scenes."""
+        """Tell whether training began with easier scenes."""
         return bool(self.config["task"].get("curriculum", {}).get("enabled", False))
 
     @property
@@ -141,7 +141,7 @@ def _read(folder: RunFolder, name: str) -> Run | Evaluation | Problem:
 
 
 def _how_far(folder: RunFolder) -> str:
-    """How far a run came that has no summary, as far as it is known."""
+    """Say how far a run came that has no summary, as far as it is known."""
     try:
         frames = max(int(row["frames"]) for row in csv.DictReader(folder.metrics.open()))
     except (OSError, KeyError, ValueError, TypeError):

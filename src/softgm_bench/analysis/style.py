@@ -1,4 +1,4 @@
-"""How figures look: colours that colour-blind readers tell apart, and the same bytes for the same picture."""
+"""Style of figures: colours that colour-blind readers tell apart, and the same bytes for the same picture."""
 
 import io
 from collections.abc import Iterator

@@ -21,7 +21,6 @@ from softgm_bench.config.schema import (
     labelled,
     model_name,
 )
-from softgm_bench.errors import UserError
 
 __all__ = [
     "CHANGEABLE",
@@ -31,7 +30,6 @@ __all__ = [
     "EvaluationConfig",
     "ExperimentConfig",
     "LoggerConfig",
-    "UserError",
     "available_threads",
     "changed",
     "compose",

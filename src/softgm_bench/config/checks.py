@@ -1,4 +1,4 @@
-"""What settings of the right types must satisfy, as far as it shows without building anything."""
+"""Checks of settings that have the right types, as far as they need nothing built."""
 
 import os
 import re

@@ -1,4 +1,4 @@
-"""Whether two configurations would give the same numbers."""
+"""Comparison of two configurations: would they give the same numbers?"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any

@@ -1,4 +1,4 @@
-"""How settings are composed from ``conf/`` and the command line, and held against the dataclasses.
+"""Composition of settings from ``conf/`` and the command line, held against the dataclasses.
 
 Values live in YAML only, except the arm's, whose dataclass is the source. Hydra composes the YAML; ``typed`` then holds
 it against the dataclasses, so a misspelt key or a wrong type is refused wherever it was written.
@@ -53,7 +53,7 @@ def compose(overrides: list[str]) -> Config:
 
 
 def compose_untyped(overrides: list[str]) -> DictConfig:
-    """What the YAML files and the overrides say, before it is held against the dataclasses."""
+    """Compose what the YAML files and the overrides say, before it is held against the dataclasses."""
     with initialize_config_dir(version_base="1.3", config_dir=str(config_directory())), composing():
         return hydra_compose("config", overrides)
 

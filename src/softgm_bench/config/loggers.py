@@ -46,5 +46,15 @@ class TensorboardConfig:
 class LoggerConfig:
     """Loggers beside the run folder's own files; None: not that one."""
 
+    csv: bool = True
     wandb: WandbConfig | None = None
     tensorboard: TensorboardConfig | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse a run without files of its own.
+
+        Raises:
+            ValueError: with one line naming the key, its value and what would be right.
+        """
+        if not self.csv:
+            raise ValueError("logger.csv=False: it must be true, resuming and reports read the run folder's files")

@@ -1,4 +1,4 @@
-"""How a value in ``conf/`` depends on what was chosen elsewhere: the functions that its YAML may call.
+"""Resolvers: the functions by which a value in ``conf/`` depends on what was chosen elsewhere.
 
 ``gamma: ${tuned_or_paper:0.95, 0.99}`` has both recipes' values in the line that they belong to, so no file overrides
 another's and nothing depends on the order of files. A value on the command line, or in a recipe of a user's own,
@@ -35,7 +35,7 @@ def first(*values: Any) -> Any:
 
 
 def label(*, _root_: DictConfig) -> str:
-    """What results are named after, ``Config.label``; for run folders."""
+    """Give the name of the results, ``Config.label``, for run folders."""
     return labelled(_root_.algo.name, _root_.model.name, _root_.observation, _root_.perturbation.name)
 
 

@@ -35,7 +35,7 @@ class CheckpointConfig:
 
 @dataclass
 class ExperimentConfig:
-    """How long to train and how often to look; see ``conf/experiment/default.yaml``."""
+    """Length of training, intervals of evaluations and checkpoints; see ``conf/experiment/default.yaml``."""
 
     name: str
     total_frames: int
@@ -75,7 +75,7 @@ class Config:
 
     @property
     def oracle(self) -> bool:
-        """Whether actors are told what they would have to discover: an upper bound, not a competitor."""
+        """Tell whether actors are told what they would have to discover; such a policy is no competitor."""
         return self.observation == "oracle"
 
     @property

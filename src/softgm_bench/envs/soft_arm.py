@@ -231,7 +231,7 @@ class SoftArmEnv(EnvBase):
         return states[0] if len(states) == 1 else torch.stack(states)
 
     def set_generator_state(self, state: Tensor) -> None:
-        """Go on drawing from what ``generator_state`` returned."""
+        """Resume drawing from what ``generator_state`` returned."""
         for generator, own in zip(self.simulator.generators(), state.reshape(-1, state.shape[-1]), strict=True):
             generator.set_state(own.clone())  # a view's offset would not be heeded
 

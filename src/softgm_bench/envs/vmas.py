@@ -225,7 +225,7 @@ class VmasEnv(EnvBase):
         return self._generator.clone()
 
     def set_generator_state(self, state: Tensor) -> None:
-        """Go on drawing from what ``generator_state`` returned."""
+        """Resume drawing from what ``generator_state`` returned."""
         self._generator = state.clone()
 
     def simulation_state(self) -> TensorDict:
@@ -238,7 +238,7 @@ class VmasEnv(EnvBase):
         return TensorDict(state, self.batch_size)
 
     def load_simulation_state(self, state: TensorDictBase) -> None:
-        """Go on from what ``simulation_state`` returned for as many environments of the same task."""
+        """Resume from what ``simulation_state`` returned for as many environments of the same task."""
         entries = len(self._names) + 1
         self._write([state[f"state{index}"].clone() for index in range(entries)])
         self._store = [state[f"store{index}"].clone() for index in range(entries) if f"store{index}" in state]

@@ -8,10 +8,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from softgm_bench.config import GROUPS, UserError, plain
+from softgm_bench.config import GROUPS, plain
 from softgm_bench.episodes.evaluation import EpisodeRecords
 from softgm_bench.episodes.policy import TrainedPolicy
 from softgm_bench.episodes.summary import summarise
+from softgm_bench.errors import UserError
 from softgm_bench.storage.files import to_json, write_atomically
 from softgm_bench.storage.run_folder import RunFolder
 from softgm_bench.storage.versions import versions
@@ -20,7 +21,7 @@ from softgm_bench.storage.versions import versions
 def default_folder(
     source: Path, trained: TrainedPolicy, overrides: Sequence[str], seed: int, unusual: Mapping[str, Any]
 ) -> Path:
-    """Where an evaluation goes if nobody says: into the run that the policy was read from, if it was one.
+    """Choose an evaluation's folder: inside the run that the policy was read from, if it was one.
 
     Args:
         source: run folder, checkpoint or policy's file.
@@ -60,7 +61,7 @@ def check(folder: Path, overwrite: bool) -> None:
 
 
 def describe(trained: TrainedPolicy, records: EpisodeRecords, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """What ``summary.json`` holds: which policy, what it acted in, ``settings`` of the evaluation, and the metrics."""
+    """Fill ``summary.json``: the policy, what it acted in, ``settings`` of the evaluation, and the metrics."""
     run, config = trained.run, trained.config
     return {
         "task": config.task.name,

@@ -147,7 +147,7 @@ class _Recorder:
             self.attention.setdefault(stage, []).append(values[0].numpy(force=True))
 
     def trajectory(self, config: dict[str, Any], info: dict[str, Any]) -> Trajectory:
-        """What was collected."""
+        """Give what was collected."""
         cylinders = self.env.scene.cylinders
         exists = self._own(cylinders.mask)
         return Trajectory(

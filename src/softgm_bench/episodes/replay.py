@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from softgm_bench.config import UserError
 from softgm_bench.episodes.trajectory import ROD, Array, Trajectory
+from softgm_bench.errors import UserError
 from softgm_bench.rod import backend as rod_backend
 from softgm_bench.rod.actuation import Actuation
 from softgm_bench.rod.divergence import diverged
@@ -59,7 +59,7 @@ def replay(trajectory: Trajectory, backend: str, pruning: bool = False) -> Repla
 
 
 def compare(trajectory: Trajectory, replayed: Replay) -> dict[str, Any]:
-    """How far a replay is from the recording.
+    """Measure how far a replay is from the recording.
 
     Returns:
         ``identical``: whether all bits are equal. ``largest``: the largest difference of a component over the episode,

@@ -1,4 +1,4 @@
-"""What an evaluation says in numbers, ``summary.json`` and the table at a run's end."""
+"""An evaluation in numbers: the metrics of ``summary.json`` and the table at a run's end."""
 
 import math
 from collections.abc import Mapping

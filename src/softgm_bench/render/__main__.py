@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from softgm_bench import command
-from softgm_bench.config import UserError
+from softgm_bench.errors import UserError
 
 if TYPE_CHECKING:
     from softgm_bench.episodes.trajectory import Trajectory

@@ -13,7 +13,7 @@ from softgm_bench.rod.state import Cylinders
 
 
 def contact_nodes(position: Tensor, volume: Tensor, cylinders: Cylinders) -> Tensor:
-    """Which nodes touch any cylinder: distance to its axis segment below the sum of radii.
+    """Find the nodes that touch any cylinder: distance to its axis segment below the sum of radii.
 
     A node's radius is the mean of its elements' radii, an element's the one that keeps its volume.
 

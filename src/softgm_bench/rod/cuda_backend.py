@@ -96,7 +96,7 @@ class CudaBackend:
 
 
 def _inputs(dtype: torch.dtype, *tensors: Tensor) -> list[Tensor]:
-    """What a kernel can read; no copies where dtype and layout are right already."""
+    """Give what a kernel can read; no copies where dtype and layout are right already."""
     return [tensor.detach().to(dtype).contiguous() for tensor in tensors]
 
 

@@ -182,7 +182,7 @@ def _make_drift(real: type) -> Callable[..., Any]:
 
 
 def _show(node, k, x, y, z, vx, vy, vz, q00, q01, q02, q10, q11, q12, q20, q21, q22):
-    """What the left neighbour needs to know of node and element k."""
+    """Give what the left neighbour needs to know of node and element k."""
     node[0, k], node[1, k], node[2, k] = x, y, z
     node[3, k], node[4, k], node[5, k] = vx, vy, vz
     node[6, k], node[7, k], node[8, k] = q00, q01, q02

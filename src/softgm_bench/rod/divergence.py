@@ -1,4 +1,4 @@
-"""Which rods have broken: a compiled loop on the CPU, tensors elsewhere."""
+"""Detection of broken rods: a compiled loop on the CPU, tensors elsewhere."""
 
 import numba
 import torch

@@ -1,4 +1,4 @@
-"""Where values may steer the program, and where reading one would make the processors wait for each other.
+"""Devices on which a value may steer the program, and those on which reading one makes the processors wait.
 
 On a CPU reading a tensor's values is free, so compiled loops skip what is not there. On any other device reading one
 stops both processors until all queued work is done; there the same results come from shapes that do not depend on

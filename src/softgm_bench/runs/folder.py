@@ -24,7 +24,7 @@ def create(run_dir: str, config: Mapping[str, Any], overwrite: bool) -> RunFolde
     folder = RunFolder(Path(run_dir))
     held = _held_run(folder)
     if held and not overwrite:
-        going_on = "" if folder.summary.exists() else "resume=true to go on with it, "
+        going_on = "" if folder.summary.exists() else "resume=true to resume it, "
         advice = f"add {going_on}overwrite=true to replace it or choose another run_dir"
         raise UserError(f"run_dir={run_dir} holds {held}: {advice}")
     try:
@@ -115,7 +115,7 @@ def _keep_lines(path: Path, count: int) -> None:
 
 
 def _held_run(folder: RunFolder) -> str:
-    """What kind of run the folder holds, in words; empty if none."""
+    """Say in words what kind of run the folder holds; empty if none."""
     if folder.summary.exists():
         return "a finished run"
     return "an unfinished run" if any(path.exists() for path in _files(folder)) else ""
@@ -133,7 +133,7 @@ def _files(folder: RunFolder) -> list[Path]:
 
 
 def _left_over(folder: RunFolder) -> list[Path]:
-    """What a process that was killed while it wrote a file has left."""
+    """List the files that a process left when it was killed while writing."""
     names = [path.name for path in (folder.summary, folder.config)]
     files = [folder.path / f".{name}.tmp" for name in names] + list(folder.checkpoints.glob(".frames-*.pt.tmp"))
     return [path for path in files if path.exists()]

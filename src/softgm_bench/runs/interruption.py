@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM end a run where its state is whole, so that the checkpoint written then can be gone on from."""
+"""Ctrl-C and SIGTERM end a run where its state is whole: it can be resumed from the checkpoint written then."""
 
 import os
 import signal
@@ -44,7 +44,7 @@ class Interruption:
 
     @contextmanager
     def at_once(self) -> Iterator[None]:
-        """Around work that may be broken off anywhere, such as an evaluation."""
+        """Let a signal interrupt the work inside anywhere, such as an evaluation."""
         self._at_once = True
         try:
             self.check()

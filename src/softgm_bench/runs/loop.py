@@ -50,7 +50,7 @@ def train(config: Config) -> dict[str, Any]:
                 return _finish(run, records)
     except OSError as error:  # a full disk, or a folder taken away
         place = error.filename or run.folder.path
-        raise UserError(f"{place}: {error.strerror}; earlier checkpoints are whole, resume=true goes on") from error
+        raise UserError(f"{place}: {error.strerror}; earlier checkpoints are whole, resume=true resumes it") from error
     finally:
         run.collector.shutdown()
 
@@ -68,7 +68,7 @@ def _go(run: Run) -> EpisodeRecords:
                 seed = run.seeds.final_evaluation
                 return _evaluate(run, settings.final_episodes, seed, settings.final_horizon)
         except Interrupted as stop:
-            stop.args = (f"interrupted after {run.frames} frames, resume=true goes on; checkpoint: {_save(run)}",)
+            stop.args = (f"interrupted after {run.frames} frames, resume=true resumes it; checkpoint: {_save(run)}",)
             raise
 
 
@@ -88,7 +88,7 @@ def _build(config: Config) -> Run:
 
 
 def _begin(run: Run) -> None:
-    """Make the run's folder, or go on with the run in it."""
+    """Make the run's folder, or resume the run in it."""
     config = run.config
     state = resume.newest_state(config) if config.resume else None
     if state is None:
@@ -100,7 +100,7 @@ def _begin(run: Run) -> None:
 def _learn(run: Run, interruption: Interruption, progress: Progress) -> None:
     experiment = run.config.experiment
     with CsvWriter(run.folder.metrics, append=run.iteration > 0) as metrics:
-        _evaluate_if_due(run, interruption, progress)  # one that the signal before a resumption broke off
+        _evaluate_if_due(run, interruption, progress)  # one that a signal interrupted before the run was resumed
         began = time.perf_counter()
         for batch in _batches(run):
             losses = run.algorithm.update(batch)
@@ -125,7 +125,7 @@ def _batches(run: Run) -> Iterator[TensorDictBase]:
 
 
 def _crossed(interval: int, frames: int, new_frames: int) -> bool:
-    """Whether a multiple of ``interval`` lies among the newest frames."""
+    """Tell whether a multiple of ``interval`` lies among the newest frames."""
     return frames // interval > (frames - new_frames) // interval
 
 
@@ -166,7 +166,7 @@ def _evaluate_if_due(run: Run, interruption: Interruption, progress: Progress) -
 
 
 def _save(run: Run) -> Path:
-    folder.to_disk(run.folder)  # what a checkpoint goes on from must not be lost where it is not
+    folder.to_disk(run.folder)  # rows that a checkpoint counts on must not be lost where it is not
     keep = run.config.experiment.checkpoint.keep
     return checkpoint.save(run.folder, run.frames, run.state_dict(), keep)
 

@@ -1,4 +1,4 @@
-"""What is written during training: ``metrics.csv``, one row an iteration, and the statistics of its episodes."""
+"""Written during training: ``metrics.csv``, one row an iteration, and the statistics of its episodes."""
 
 import csv
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ class CsvWriter:
     """Appends rows to a CSV file, each written out before the next begins. The first row names the columns."""
 
     def __init__(self, path: Path, append: bool = False) -> None:
-        """Create the file, or empty it; with ``append``, go on after the rows that it holds."""
+        """Create the file, or empty it; with ``append``, append to the rows that it holds."""
         self._file = path.open("a+" if append else "w", newline="")
         self._writer: csv.DictWriter | None = None
         if append:
@@ -79,11 +79,11 @@ class EpisodeTracker:
         return row
 
     def state_dict(self) -> dict[str, torch.Tensor]:
-        """What the episodes under way have gathered."""
+        """Give what the episodes under way have gathered."""
         return {"return": self._return, "length": self._length}
 
     def load_state_dict(self, state: Mapping[str, torch.Tensor]) -> None:
-        """Go on from what ``state_dict`` returned for as many environments."""
+        """Resume from what ``state_dict`` returned for as many environments."""
         self._return.copy_(state["return"])
         self._length.copy_(state["length"])
 

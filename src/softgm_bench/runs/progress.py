@@ -1,4 +1,4 @@
-"""How far a run is: a bar in a terminal, now and then a plain line anywhere else."""
+"""Progress of a run: a bar in a terminal, now and then a plain line anywhere else."""
 
 import math
 import sys

@@ -1,7 +1,7 @@
-"""Going on with a run that was broken off: whether it can be, and from which checkpoint.
+"""Resume a run that was interrupted, if that is possible, from its newest checkpoint that is whole.
 
 What a checkpoint holds is ``Run.state_dict``. On the same machine, with the same versions and number of threads, a run
-that was broken off and gone on with writes the numbers of one that was not, bit by bit.
+that was interrupted and resumed writes the numbers of one that was not, bit by bit.
 """
 
 import json
@@ -12,9 +12,10 @@ from typing import Any, cast
 from omegaconf import DictConfig, OmegaConf
 from yaml import YAMLError
 
-from softgm_bench.config import Config, UserError, plain, typed
+from softgm_bench.config import Config, plain, typed
 from softgm_bench.config.comparison import ABSENT, differences
 from softgm_bench.config.explain import USER_ERRORS
+from softgm_bench.errors import UserError
 from softgm_bench.runs import checkpoint
 from softgm_bench.runs import folder as run_folder
 from softgm_bench.runs.folder import ANEW
@@ -30,7 +31,7 @@ def finished(config: Config, frames: int) -> dict[str, Any] | None:
 
     Args:
         config: of the run.
-        frames: where its end is; a run that ended earlier was shorter and is to go on.
+        frames: where its end is; a run that ended earlier was shorter and is to be resumed.
 
     Raises:
         UserError: the run has other settings, or cannot be read.
@@ -67,11 +68,11 @@ def newest_state(config: Config) -> dict[str, Any] | None:
         except UserError as error:
             _say(f"passed over {error}")
             continue
-        _say(f"{folder.path}: going on after {state['frames']} frames")
+        _say(f"{folder.path}: resuming after {state['frames']} frames")
         return state
     if paths:
         raise UserError(f"{folder.checkpoints}: no checkpoint here is whole; {ANEW}")
-    _say(f"{folder.path}: no checkpoint to go on from, the run begins anew")
+    _say(f"{folder.path}: no checkpoint to resume from, the run begins anew")
     return None
 
 
@@ -85,7 +86,7 @@ def restore(run: Run, state: dict[str, Any]) -> None:
         run.load_state_dict(state)
         before = state["versions"]
     except (KeyError, AttributeError, TypeError, RuntimeError, ValueError) as error:
-        raise UserError(f"{run.folder.path}: this version cannot go on from its checkpoint; {ANEW}") from error
+        raise UserError(f"{run.folder.path}: this version cannot resume from its checkpoint; {ANEW}") from error
     for name, version in versions().items():
         if before.get(name) != version:
             _say(f"{run.folder.path}: {name} was {before.get(name)} and is {version}: numbers may not repeat")

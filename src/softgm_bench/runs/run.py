@@ -61,7 +61,7 @@ class Run:
         return min(self.iteration, self.frames // self.config.experiment.evaluation.interval)
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that going on needs, and what it belongs to: tensors and plain Python values."""
+        """Give everything that resuming needs, and what it belongs to: tensors and plain Python values."""
         return {
             "algorithm": self.algorithm.state_dict(),
             "random": checkpoint.random_state(),
@@ -79,7 +79,7 @@ class Run:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from a checkpoint: what ``state_dict`` returned, and ``frames``."""
+        """Resume from a checkpoint: what ``state_dict`` returned, and ``frames``."""
         self.algorithm.load_state_dict(state["algorithm"])
         environment, counters = state["environment"], state["counters"]
         simulation = TensorDict(environment["simulation"], self.env.batch_size, device=self.env.device)

@@ -67,7 +67,7 @@ def run(composed: DictConfig) -> str:
 
 
 def finished(values: Mapping[str, Any], run_dir: Path) -> str:
-    """What a finished run with these settings achieved; empty if the folder holds none.
+    """Read what a finished run with these settings achieved; empty if the folder holds none.
 
     Settings are compared as far as both have them, without building anything: what differs is left to ``resume``.
     """
@@ -131,7 +131,7 @@ def _train_apart(values: Mapping[str, Any], overrides: list[str], cwd: Path) -> 
 
 
 def _outcome(answer: str, status: int, run_dir: Path) -> dict[str, str]:
-    """What the training said last; if it said nothing, what became of its process."""
+    """Give what the training said last; if it said nothing, what became of its process."""
     try:
         return json.loads(answer.splitlines()[-1])
     except (IndexError, ValueError):

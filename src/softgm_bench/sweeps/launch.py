@@ -21,7 +21,8 @@ from hydra.core.override_parser.types import Override
 from hydra.core.plugins import Plugins
 from omegaconf import DictConfig
 
-from softgm_bench.config import UserError, available_threads, composing, config_directory
+from softgm_bench.config import available_threads, composing, config_directory
+from softgm_bench.errors import UserError
 from softgm_bench.sweeps import cell as sweep_cell
 
 JOBLIB, LOCAL, SLURM, RAY = "joblib", "submitit_local", "submitit_slurm", "ray"
@@ -39,7 +40,7 @@ class Cell:
 
 @dataclass
 class Plan:
-    """What a sweep's command line is completed by.
+    """The settings that complete a sweep's command line.
 
     Attributes:
         overrides: the user's, then ours: launcher, jobs at once, threads, where outcomes go.
@@ -66,7 +67,7 @@ class Outcomes:
 
     @property
     def all_well(self) -> bool:
-        """Whether every job has come to an end and none failed; a full disk can keep one from saying so."""
+        """Tell whether every job has ended and none failed; a full disk can keep one from saying so."""
         return len(self.seen) == self.jobs and not self.failed
 
 
@@ -98,7 +99,7 @@ def plan(overrides: Sequence[str], directory: str | None = None) -> Plan:
 
 
 def installed(launcher: str) -> bool:
-    """Whether Hydra's plug-in of that name can be imported."""
+    """Tell whether Hydra's plug-in of that name can be imported."""
     package = "submitit" if launcher.startswith("submitit") else launcher
     try:
         return find_spec(f"hydra_plugins.hydra_{package}_launcher") is not None

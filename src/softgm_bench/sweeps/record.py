@@ -1,4 +1,4 @@
-"""What the jobs of a sweep leave in their run folders, and what a folder says about its run.
+"""Records that the jobs of a sweep leave in their run folders, and what a folder says about its run.
 
 ``running.json``: which process is at work. ``failure.json``: why the last attempt came to nothing. Both are gone when a
 run has finished.
@@ -70,7 +70,7 @@ def forget_failure(run_dir: Path) -> None:
 
 
 def state(run_dir: Path) -> State:
-    """What a folder says about its run; a lock tells a run at work from one that was killed."""
+    """Read a run's state from its folder; a lock tells a run at work from one that was killed."""
     folder = RunFolder(run_dir)
     if _locked(run_dir):
         return State(RUNNING, ", ".join(filter(None, [_process(run_dir), _progress(folder)])))
@@ -112,7 +112,7 @@ def _read(path: Path) -> Mapping[str, Any]:
 
 
 def _locked(run_dir: Path) -> bool:
-    """Whether a process trains in the folder: ``run_folder.exclusive`` locks it, and the system unlocks it."""
+    """Tell whether a process trains in the folder: ``run_folder.exclusive`` locks it, the system unlocks it."""
     try:
         import fcntl
 

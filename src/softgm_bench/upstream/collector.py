@@ -40,5 +40,5 @@ class FrameCollector(Collector):
         return self._carrier.clone().to_dict()
 
     def show(self, frame: Mapping[str, Any]) -> None:
-        """Go on from what ``shown`` returned; the environment must be put where it was then, too."""
+        """Resume from what ``shown`` returned; the environment must be put where it was then, too."""
         self._carrier.update(TensorDict(dict(frame), self._carrier.batch_size, device=self._carrier.device))

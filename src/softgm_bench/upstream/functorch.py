@@ -1,4 +1,4 @@
-"""Whether torch's function transforms (vmap and the like) are at work, which torch 2.13 tells by private functions."""
+"""Detection of torch's function transforms (vmap and the like), which torch 2.13 tells by private functions."""
 
 import torch
 from torch import Tensor

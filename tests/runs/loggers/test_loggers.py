@@ -10,7 +10,8 @@ import numba
 import pytest
 import torch
 
-from softgm_bench.config import UserError, compose
+from softgm_bench.config import compose
+from softgm_bench.errors import UserError
 from softgm_bench.runs.loggers import guarded
 from softgm_bench.runs.loggers.guarded import Loggers, flattened
 from softgm_bench.runs.loop import train
@@ -293,6 +294,7 @@ def test_a_disk_that_fills_up_costs_one_line(tmp_path, capsys):
         ("logger.wandb.mode=onlin", "logger.wandb.mode=onlin: choose one of online"),
         ("logger.wandb.project=''", "logger.wandb.project is empty"),
         ("logger.tensorboard.flush_seconds=0", "logger.tensorboard.flush_seconds=0: it must be at least 1"),
+        ("logger.csv=false", "logger.csv=False: it must be true"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(override, says):
@@ -304,3 +306,12 @@ def test_nested_numbers_get_names_of_their_own():
     nested = {"episodes": 4, "success_rate": {"mean": 0.5, "low": 0.1}, "note": "none", "gone": None}
 
     assert flattened(nested) == {"episodes": 4, "success_rate": 0.5, "success_rate_low": 0.1}
+
+
+@pytest.mark.parametrize("chosen", ["[wandb,csv]", "[csv,wandb]", "wandb"])
+def test_the_order_of_loggers_does_not_matter(chosen):
+    logger = compose([f"logger={chosen}"]).logger
+
+    assert logger.csv
+    assert logger.wandb is not None
+    assert logger.tensorboard is None

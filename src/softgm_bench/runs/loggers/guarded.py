@@ -1,4 +1,4 @@
-"""What a run tells its loggers. They only listen: none can change a run, and none can end it."""
+"""The loggers of a run. They only listen: none can change a run, and none can end it."""
 
 import math
 import os
@@ -49,7 +49,7 @@ class Loggers:
         self._tell(lambda logger: logger.log(int(row["frames"]), values))
 
     def evaluation(self, frames: int, metrics: Mapping[str, Any]) -> None:
-        """What ``summarise`` made of an evaluation during training."""
+        """Pass on what ``summarise`` made of an evaluation during training."""
         values = {f"evaluation/{name}": value for name, value in flattened(metrics).items()}
         self._tell(lambda logger: logger.log(frames, values))
 

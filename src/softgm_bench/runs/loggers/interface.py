@@ -1,4 +1,4 @@
-"""What a run tells a logger."""
+"""The interface of a logger: what a run tells it."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol

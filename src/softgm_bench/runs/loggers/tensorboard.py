@@ -24,7 +24,7 @@ threading.excepthook = partial(_unless_writing, threading.excepthook)
 
 
 class TensorboardLogger:
-    """An event file a process; what a resumed run repeats replaces what was written before it was broken off."""
+    """An event file a process; what a resumed run repeats replaces what was written before the interruption."""
 
     def __init__(self, config: Config, folder: Path, frames: int) -> None:
         """Open an event file and note the configuration."""

@@ -1,4 +1,4 @@
-"""Replay memory for observations that are a plain vector per agent: whole transitions side by side."""
+"""A replay buffer for observations that are a plain vector per agent: whole transitions side by side."""
 
 from typing import Any
 
@@ -18,8 +18,8 @@ STORED = (
 )
 
 
-class VectorReplay:
-    """A ring of the newest ``capacity`` transitions, with what ``Replay`` offers.
+class VectorReplayBuffer:
+    """A ring of the newest ``capacity`` transitions, with what ``ReplayBuffer`` offers.
 
     TorchRL's buffers do the same; a sample of 128 takes them three times as long.
 
@@ -65,7 +65,7 @@ class VectorReplay:
         return {"held": held, "stored": self.stored}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from what ``state_dict`` returned for a memory of the same capacity."""
+        """Resume from what ``state_dict`` returned for a memory of the same capacity."""
         self.stored = state["stored"]
         if state["held"] is not None:
             held = TensorDict(state["held"], [len(self)], device=self.device)

@@ -2,7 +2,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from softgm_bench.algorithms.vector_replay import VectorReplay
+from softgm_bench.algorithms.vector_replay_buffer import VectorReplayBuffer
 from softgm_bench.envs import entries
 from softgm_bench.envs.vmas import OBSERVATION
 
@@ -18,7 +18,7 @@ def frames(first, envs=2, steps=3):
 
 
 def test_a_sample_is_a_stored_transition():
-    replay = VectorReplay(100, "cpu")
+    replay = VectorReplayBuffer(100, "cpu")
     replay.add(frames(0))
     sample = replay.sample(64)
     number = sample[OBSERVATION][:, 0, 0]
@@ -31,7 +31,7 @@ def test_a_sample_is_a_stored_transition():
 
 
 def test_the_newest_are_kept():
-    replay = VectorReplay(8, "cpu")
+    replay = VectorReplayBuffer(8, "cpu")
     for first in (0, 6, 12):
         replay.add(frames(first))
     assert (len(replay), replay.stored) == (8, 18)
@@ -40,11 +40,11 @@ def test_the_newest_are_kept():
 
 def test_more_than_it_holds_is_refused():
     with pytest.raises(ValueError, match=r"algo\.replay_capacity is 5: it must hold the 6 frames"):
-        VectorReplay(5, "cpu").add(frames(0))
+        VectorReplayBuffer(5, "cpu").add(frames(0))
 
 
 def test_a_saved_memory_goes_on_exactly():
-    replay, other = VectorReplay(8, "cpu"), VectorReplay(8, "cpu")
+    replay, other = VectorReplayBuffer(8, "cpu"), VectorReplayBuffer(8, "cpu")
     replay.add(frames(0))
     other.load_state_dict(replay.state_dict())
     for memory in (replay, other):

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 
-from softgm_bench.algorithms.replay import FRAMES_PER_EPISODE, Replay
+from softgm_bench.algorithms.replay_buffer import FRAMES_PER_EPISODE, ReplayBuffer
 from softgm_bench.envs import entries, make_env
 from softgm_bench.envs.interface import Sizes
 from softgm_bench.rod.parameters import RodParameters
@@ -104,7 +104,7 @@ def same(sampled, stored):
 def test_what_is_held_equals_what_was_stored_bit_for_bit(num_envs, lengths, ends, rows, n_slots, interrupted, seed):
     """Episodes of any length, ends of both kinds, resets between batches, rings that wrap around."""
     some = streams(num_envs, n_slots=n_slots, ends=ends, seed=seed)
-    replay = Replay(rows * num_envs, num_envs, Sizes(2, 2, n_slots=n_slots), "cpu")
+    replay = ReplayBuffer(rows * num_envs, num_envs, Sizes(2, 2, n_slots=n_slots), "cpu")
     for index, steps in enumerate(lengths):
         if index in interrupted:
             some[-1].begin()
@@ -125,7 +125,7 @@ def test_what_is_held_equals_what_was_stored_bit_for_bit(num_envs, lengths, ends
 def test_sampling_is_uniform_over_all_that_is_held():
     some = streams(2, ends=0.5)
     some[1].ends = 0.0
-    replay = Replay(64, 2, Sizes(2, 2, n_slots=11), "cpu")
+    replay = ReplayBuffer(64, 2, Sizes(2, 2, n_slots=11), "cpu")
     for _ in range(10):
         replay.add(batch_of(some, 5))
     assert len(held(replay)) == len(replay) < 64  # short episodes made the first environment give up old frames
@@ -141,7 +141,7 @@ def test_half_a_million_transitions_on_the_wall_fit_in_four_gibibytes(settings):
     env = make_env(settings("task=wall").task, RodParameters(), num_envs=128, seed=0)
     observation = env.reset().select(*entries.OBSERVATION)
     plain = 2 * sum(value.nbytes for value in observation.values(True, True)) / 128  # now and next, as they come
-    replay = Replay(25_600, 128, env.sizes, "cpu")
+    replay = ReplayBuffer(25_600, 128, env.sizes, "cpu")
     owned = [value for value in vars(replay).values() if isinstance(value, torch.Tensor)]
     owned += [value for group in (replay._frames, replay._last) for value in group.values()]
     taken = sum(tensor.untyped_storage().nbytes() for tensor in owned) / 25_600
@@ -154,7 +154,7 @@ def test_transitions_of_the_arm_come_back_as_they_were(settings):
     """Real frames with discovered bins, edges, truncations and the resets of a collector."""
     config = settings("task=wall", "task.sensing_radius=0.4")
     env = make_env(config.task, RodParameters(substeps=5), num_envs=3, seed=0, horizon=4)
-    replay = Replay(240, 3, env.sizes, "cpu")
+    replay = ReplayBuffer(240, 3, env.sizes, "cpu")
     collector = Collector(env, None, frames_per_batch=9, total_frames=54)
     frames = []
     for batch in collector:
@@ -178,7 +178,7 @@ def test_transitions_of_the_arm_come_back_as_they_were(settings):
 
 def test_a_loaded_memory_holds_and_samples_the_same():
     some = streams(2)
-    replay, other = (Replay(40, 2, Sizes(2, 2, n_slots=11), "cpu") for _ in range(2))
+    replay, other = (ReplayBuffer(40, 2, Sizes(2, 2, n_slots=11), "cpu") for _ in range(2))
     replay.add(batch_of(some, 7))
     other.load_state_dict(replay.state_dict())
     for memory in (replay, other):
@@ -194,8 +194,8 @@ def test_a_loaded_memory_holds_and_samples_the_same():
 
 def test_what_cannot_be_stored_is_refused_with_a_reason():
     with pytest.raises(ValueError, match=r"replay_capacity is 7.* two frames of each of 4 environments"):
-        Replay(7, 4, Sizes(2, 2, n_slots=11), "cpu")
-    replay = Replay(FRAMES_PER_EPISODE, 2, Sizes(2, 2, n_slots=11), "cpu")
+        ReplayBuffer(7, 4, Sizes(2, 2, n_slots=11), "cpu")
+    replay = ReplayBuffer(FRAMES_PER_EPISODE, 2, Sizes(2, 2, n_slots=11), "cpu")
     with pytest.raises(ValueError, match="it must hold the 10 frames of one iteration"):
         replay.add(batch_of(streams(2), 5))
     gap = batch_of(streams(2), 3)

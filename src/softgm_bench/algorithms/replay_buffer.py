@@ -1,4 +1,4 @@
-"""Replay memory for off-policy learning: compact, and what is sampled equals what was stored bit by bit.
+"""A replay buffer for off-policy learning: compact, and what is sampled equals what was stored bit by bit.
 
 A transition's two observations are one frame and the next one of the same environment, so each frame is stored once.
 What does not change within an episode, the descriptors of discovered obstacles, is stored once an episode: slots are
@@ -30,7 +30,7 @@ PLAIN: tuple[Key, ...] = (
 FRAMES_PER_EPISODE = 8  # room for one episode in so many frames; shorter ones make old frames go earlier
 
 
-class Replay:
+class ReplayBuffer:
     """The newest frames of ``num_envs`` environments, each a ring of its own in memory that is taken at once.
 
     Entries ``(rows, num_envs, ...)`` are rings over time, entries ``(episodes, num_envs, ...)`` rings over episodes.
@@ -145,7 +145,7 @@ class Replay:
         return {"tensors": dict(self._tensors()), "now": self._now, "size": self._size}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from what ``state_dict`` returned for a memory of the same sizes."""
+        """Resume from what ``state_dict`` returned for a memory of the same sizes."""
         for name, tensor in self._tensors().items():
             tensor.copy_(state["tensors"][name])
         self._now, self._size = state["now"], state["size"]
@@ -189,7 +189,7 @@ class Replay:
         self._episode = episode[-1] + done[-1].long()
 
     def _begins(self, first: Columns) -> Tensor:
-        """Whether the new frames, whose first is ``first`` ``(num_envs, ...)``, begin an episode, ``(num_envs,)``.
+        """Tell whether the new frames, whose first is ``first`` ``(num_envs, ...)``, begin an episode, ``(num_envs,)``.
 
         Where they do although the newest frame was not done, its episode is ended.
         """

@@ -1,0 +1,78 @@
+"""The protocol of an evaluation: its settings, as the command and the Python interface both have them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from softgm_bench.errors import UserError
+
+if TYPE_CHECKING:  # a refused command need not wait for torch
+    from softgm_bench.episodes.evaluation import EpisodeRecords
+    from softgm_bench.episodes.policy import TrainedPolicy
+
+
+@dataclass
+class Protocol:
+    """Settings that decide which episodes an evaluation plays, and how.
+
+    Attributes:
+        episodes: of which each environment plays one.
+        seed: of targets, obstacles and perturbations; the same gives the same episodes, none of them training's.
+        deterministic: act by the mode of the policy, otherwise by a sample.
+        horizon: control steps of an episode; None: the task's own.
+        gamma: of the discounted return.
+        batch: environments at once, to save memory; None: all. Others play other episodes.
+    """
+
+    episodes: int = 100
+    seed: int = 0
+    deterministic: bool = True
+    horizon: int | None = None
+    gamma: float = 0.99
+    batch: int | None = None
+
+    def check(self) -> None:
+        """Refuse values that make no sense.
+
+        Raises:
+            UserError: naming the first such setting, its value and what would be right.
+        """
+        for key in ("episodes", "horizon", "batch"):
+            value = getattr(self, key)
+            if value is not None and value < 1:
+                raise UserError(f"{key}={value}: it must be at least 1")
+        if not 0 <= self.seed < 2**63:
+            raise UserError(f"seed={self.seed}: a seed is a whole number from 0 to 2**63 - 1")
+        if not 0.0 <= self.gamma <= 1.0:
+            raise UserError(f"gamma={self.gamma}: it must lie between 0 and 1")
+
+    def play(self, trained: TrainedPolicy) -> EpisodeRecords:
+        """Play the episodes in the environment that belongs to the policy."""
+        from softgm_bench.assembly import build_env
+        from softgm_bench.episodes.evaluation import evaluate_in_parts
+
+        return evaluate_in_parts(
+            trained.policy,
+            lambda count, seed: build_env(trained.config, count, seed, self.horizon),
+            self.episodes,
+            deterministic=self.deterministic,
+            seed=self.seed,
+            gamma=self.gamma,
+            at_once=self.batch,
+        )
+
+    def describe(self, trained: TrainedPolicy, overrides: Sequence[str]) -> dict[str, Any]:
+        """Give the settings as ``summary.json`` has them, with ``overrides`` on top of the policy's own."""
+        import torch
+
+        return {
+            "evaluation_seed": self.seed,
+            "deterministic": self.deterministic,
+            "horizon": self.horizon or trained.config.task.horizon,
+            "batch": self.batch,
+            "discount": self.gamma,
+            "threads": torch.get_num_threads(),
+            "overrides": list(overrides),
+        }
