@@ -299,7 +299,7 @@ def test_a_disk_that_fills_up_costs_one_line(tmp_path, capsys):
 )
 def test_settings_that_make_no_sense_are_refused(override, says):
     with pytest.raises(UserError, match=says):
-        compose(["logger=[wandb,tensorboard]", override])
+        compose(["logger=[csv,wandb,tensorboard]", override])
 
 
 def test_nested_numbers_get_names_of_their_own():

@@ -32,11 +32,11 @@ class Loggers:
         Args:
             config: the run's.
             folder: the run's, in which each keeps its files.
-            frames: from which a resumed run goes on.
+            frames: from which a run is resumed.
         """
         self.active: dict[str, Logger] = {}
         for name, settings in asdict(config.logger).items():
-            if settings is not None:
+            if name != "csv" and settings is not None:  # the run itself writes its folder
                 self._guarded(name, partial(self._add, name, config, folder, frames))
 
     def metrics(self, row: Row) -> None:
