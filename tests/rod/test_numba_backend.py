@@ -1,4 +1,8 @@
+import os
 import re
+import subprocess
+import sys
+from pathlib import Path
 
 import numba
 import numpy as np
@@ -222,3 +226,17 @@ def test_axes_that_cross_give_no_nan(backend):
     )
     state = backend(parameters).control_step(straight_rods(parameters, 1), torch.zeros(1, 3, 20), cylinders=cylinder)
     assert all(getattr(state, name).isfinite().all() for name in FIELDS)
+
+
+@pytest.mark.slow
+def test_a_process_that_compiles_has_the_digits_of_one_that_reads_the_disk_cache(tmp_path):
+    """LLVM may optimise a function that stays a call otherwise where it stands alone: see ``scalar_contact``."""
+    command = [sys.executable, Path(__file__).parent / "contact_digits.py"]
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+
+    compiled, read = (
+        subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout for _ in range(2)
+    )
+
+    assert len(compiled.splitlines()) == 4 * len(CONTACT_MODELS)
+    assert compiled == read

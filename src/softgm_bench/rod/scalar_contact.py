@@ -6,7 +6,9 @@
 Every ``make_*`` binds its constants in one precision, because one Python float would promote float32 arithmetic, and
 compiles with what it is given: ``numba_kernel.jit`` or ``cuda_kernel.device``. ``contact`` (PyElastica's forces) and
 ``exact_contact`` (a force per unit of rest arc length) explain the two models; tests compare these functions with them.
-A compiler is told to ``inline`` what both models share, so that the order of its sums is chosen where it is used.
+A compiler is told to ``inline`` what both models share and what is long, so that the order of its sums is chosen where
+it is used. A function that LLVM leaves as a call exists twice, alone and in its caller's machine code, with sums in two
+orders: a process that compiles calls the first, one that reads the disk cache the second, and their digits differ.
 
 ``smaller``, ``larger`` and ``clip`` stand for ``min`` and ``max``, which Numba's CUDA target does not compile. They are
 in this file because Numba, before it takes a function's machine code from the disk, looks for changes in its own file
@@ -168,7 +170,7 @@ def _make_closest_points(real: type, compiler: Compiler) -> Compiled:
                 q, t = try_q, one
         return rx + q * bx - t * ax, ry + q * by - t * ay, rz + q * bz - t * az
 
-    return compiler(closest_points, clip=_compiled(clip, compiler))
+    return compiler(closest_points, inline=True, clip=_compiled(clip, compiler))
 
 
 @lru_cache
