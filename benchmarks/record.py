@@ -4,15 +4,16 @@ import json
 import os
 import platform
 import re
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
+
+from softgm_bench.storage.versions import version_of
 
 PACKAGES = ("softgm-bench", "pyelastica", "numba", "torch", "numpy", "scipy")
 
 
 def versions() -> dict[str, str]:
-    return {name: version(name) for name in PACKAGES} | {"python": platform.python_version()}
+    return {name: version_of(name) for name in PACKAGES} | {"python": platform.python_version()}
 
 
 def machine() -> dict[str, Any]:

@@ -36,7 +36,7 @@ class Loggers:
         """
         self.active: dict[str, Logger] = {}
         for name, settings in asdict(config.logger).items():
-            if settings is not None:
+            if isinstance(settings, dict):  # csv is a word, the run folder's own files
                 self._guarded(name, partial(self._add, name, config, folder, frames))
 
     def metrics(self, row: Row) -> None:
