@@ -86,7 +86,7 @@ def rehearse(run: Run) -> None:
     before = checkpoint.random_state()
     try:
         folder.checkpoints.mkdir(parents=True)
-        checkpoint.load(checkpoint.save(folder, run.frames, run.state_dict(), keep=1))
+        checkpoint.load(checkpoint.save(folder, run.frames, run.state_dict(), 1))
         write(run, folder, _few_steps(run, 1))
         if run.budget.limited:
             began = time.perf_counter()
