@@ -8,7 +8,7 @@ from softgm_bench.rod.numba_backend import NumbaBackend
 from softgm_bench.rod.parameters import RodParameters
 from softgm_bench.rod.state import Cylinders, RodState, straight_rods
 
-pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA GPU here")
+pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA GPU here")]
 
 FIELDS = ("position", "director", "velocity", "omega")
 ROUGH = {"friction_coefficient": 0.5, "velocity_damping_coefficient": 50.0}

@@ -103,13 +103,39 @@ def _do(values: dict[str, Any], overrides: list[str], cwd: Path, number: int) ->
 
 def _train_apart(values: Mapping[str, Any], overrides: list[str], cwd: Path, number: int) -> dict[str, str]:
     """Start the training and wait for it; it stops with this process or with the one that this is a worker of."""
+    child = start(values, overrides, cwd, number)
+    try:
+        while True:
+            try:
+                answer, _ = child.communicate(timeout=POLL)
+                break
+            except subprocess.TimeoutExpired:
+                pass
+            _leave_if_orphaned(child)
+    except BaseException:
+        _stop(child)
+        raise
+    return outcome(answer, child.returncode, Path(values["run_dir"]))
+
+
+def start(values: Mapping[str, Any], overrides: list[str], cwd: Path, number: int) -> subprocess.Popen:
+    """Start a training in a process of its own, which stops with this one.
+
+    Args:
+        values: of all settings, plain.
+        overrides: that led to them, for messages.
+        cwd: what relative run folders are relative to.
+        number: of the job, by which GPUs are dealt out.
+
+    Returns:
+        The process; what it prints is for ``outcome``.
+    """
     device, visible = devices.dealt(values["device"], number, os.environ)
     environment = dict(os.environ) | visible
     if values["threads"]:
         environment |= dict.fromkeys(THREADS, str(values["threads"]))
-    command = [sys.executable, "-m", "softgm_bench.sweeps.cell"]
     child = subprocess.Popen(
-        command,
+        [sys.executable, "-m", "softgm_bench.sweeps.cell"],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
@@ -117,23 +143,15 @@ def _train_apart(values: Mapping[str, Any], overrides: list[str], cwd: Path, num
         env=environment,
         start_new_session=True,  # Ctrl-C in a terminal reaches this process, which passes it on
     )
+    assert child.stdin is not None
     job = {"config": values, "overrides": overrides, "parent": os.getpid(), "device": device}
-    text: str | None = json.dumps(job)
-    try:
-        while True:
-            try:
-                answer, _ = child.communicate(text, timeout=POLL)
-                break
-            except subprocess.TimeoutExpired:
-                text = None
-            _leave_if_orphaned(child)
-    except BaseException:
-        _stop(child)
-        raise
-    return _outcome(answer, child.returncode, Path(values["run_dir"]))
+    with suppress(BrokenPipeError), child.stdin as pipe:  # it may have died already, which its status tells
+        pipe.write(json.dumps(job))
+    child.stdin = None
+    return child
 
 
-def _outcome(answer: str, status: int, run_dir: Path) -> dict[str, str]:
+def outcome(answer: str, status: int, run_dir: Path) -> dict[str, str]:
     """Give what the training said last; if it said nothing, what became of its process."""
     try:
         return json.loads(answer.splitlines()[-1])

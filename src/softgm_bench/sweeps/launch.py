@@ -93,7 +93,11 @@ def plan(overrides: Sequence[str], directory: str | None = None) -> Plan:
     base = _compose(_first_values(given), directory)
     threads = _swept_threads(given) or base.threads
     records = Path(base.hydra.sweep.dir).resolve() / f".sweep-{uuid4().hex[:12]}"
-    environment: dict[str, object] = {sweep_cell.RECORDS: records, sweep_cell.CWD: Path.cwd(), sweep_cell.MAIN: os.getpid()}
+    environment: dict[str, object] = {
+        sweep_cell.RECORDS: records,
+        sweep_cell.CWD: Path.cwd(),
+        sweep_cell.MAIN: os.getpid(),
+    }
     if base.device == "cuda" and chosen in (None, "basic", JOBLIB, LOCAL) and len(found := devices.gpus()) > 1:
         environment[devices.GPUS] = ",".join(found)  # queues give a job its own
     own = _bounds(chosen or "basic", base, threads, given)

@@ -1,7 +1,7 @@
 """Records that the jobs of a sweep leave in their run folders, and what a folder says about its run.
 
-``running.json``: which process is at work, on which device. ``failure.json``: why the last attempt came to nothing. Both are gone when a
-run has finished.
+``running.json``: which process is at work, on which device. ``failure.json``: why the last attempt came to nothing.
+Both are gone when a run has finished.
 """
 
 import csv
