@@ -38,9 +38,9 @@ LOG, BENCHMARK, RATES, TESTS = "log.txt", "benchmark.txt", "gpu.json", "gpu_test
 class Log:
     """Lines with the seconds since the beginning, on the screen, in a file and, when one was added, in the pack."""
 
-    def __init__(self, work: Path, pack: Pack) -> None:
-        """Go on at the end of an earlier log."""
-        self._work, self._pack, self._began = work, pack, time.monotonic()
+    def __init__(self, work: Path, pack: Pack, began: float) -> None:
+        """Go on at the end of an earlier log; ``began`` is on the clock of ``time.monotonic``."""
+        self._work, self._pack, self._began = work, pack, began
 
     def __call__(self, line: str) -> None:
         """Add a line; a full disk does not end the campaign."""
@@ -55,7 +55,8 @@ class Log:
 def main() -> int:
     """Do it; 0, 2 if the settings make no sense, 128 plus its number after a signal."""
     options = arguments()
-    end = time.monotonic() + 60.0 * options.minutes - options.reserve
+    began = time.monotonic()
+    end = began + 60.0 * options.minutes - options.reserve
     signal.signal(signal.SIGTERM, interrupt)
     try:
         overrides = [*options.first, *([f"+grids={options.grid}"] if options.grid else []), *options.settings]
@@ -66,9 +67,12 @@ def main() -> int:
     except USER_ERRORS as error:
         print(f"gpu_campaign: {explain(error, overrides)}", file=sys.stderr)
         return 2
+    if any(options.out.glob("pack-*.tar.gz")) and not (options.work / LOG).exists():
+        print(f"gpu_campaign: --out {options.out} holds another campaign's archives: choose another", file=sys.stderr)
+        return 2
     options.work.mkdir(parents=True, exist_ok=True)
     pack = Pack(options.out)
-    say = Log(options.work, pack)
+    say = Log(options.work, pack, began)
     say(f"{options.minutes:g} minutes, {options.jobs} cells at once of {len(cells)}; done before: {len(done)}")
     describe_machine(say)
     background: list[subprocess.Popen] = []

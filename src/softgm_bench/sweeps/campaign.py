@@ -4,7 +4,6 @@ What is finished is packed at once (``packing``). A cell gets its share of the t
 ``experiment.minutes``; at the end whatever still runs is stopped.
 """
 
-import json
 import math
 import os
 import shutil
@@ -24,6 +23,7 @@ from softgm_bench.sweeps import cell as sweep_cell
 from softgm_bench.sweeps.launch import cells
 from softgm_bench.sweeps.packing import Pack, piece
 
+RUNS, UNFINISHED = "runs", "unfinished"  # folders in the packs
 POLICY = "policy.pt"  # in a run folder: what remains of its checkpoints
 POLL = 0.2  # seconds between looks at the trainings
 TAIL = 12  # lines of a failed cell's output in the log
@@ -168,30 +168,31 @@ def _end(campaign: Campaign, name: str, child: subprocess.Popen, pack: Pack, say
     say(f"{name}: {outcome['outcome']}, {outcome['line']}")
     if outcome["outcome"] == sweep_cell.DONE:
         _keep(campaign, name, pack, say)
+    elif outcome["outcome"] == sweep_cell.INTERRUPTED and RunFolder(campaign.work / name).newest():
+        _keep(campaign, name, pack, say, UNFINISHED)
     elif outcome["outcome"] == sweep_cell.FAILED:
         for line in _tail(campaign.work / name / sweep_cell.LOG):
             say(f"    {line}")
 
 
-def _keep(campaign: Campaign, name: str, pack: Pack, say: Say) -> None:
-    """Turn checkpoints into the policy's file and pack the cell; what goes wrong is said and stops no other cell."""
+def _keep(campaign: Campaign, name: str, pack: Pack, say: Say, top: str = RUNS) -> None:
+    """Export the policy and pack the cell without its checkpoints; what goes wrong is said and stops no other cell."""
     folder = RunFolder(campaign.work / name)
     policy_file = folder.path / POLICY
     try:
-        if not policy_file.exists():
+        if folder.newest():
             from softgm_bench.episodes import policy  # late: it brings torch along
 
             policy.save(policy.load(folder.path), policy_file)
-        shutil.rmtree(folder.checkpoints, ignore_errors=True)
+        if top == RUNS:
+            shutil.rmtree(folder.checkpoints, ignore_errors=True)
     except Exception as error:
         say(f"{name}: no policy could be exported, {type(error).__name__}: {error}")
     files = [folder.config, folder.metrics, folder.evaluations, folder.episodes, folder.summary, policy_file]
     try:
-        pack.add(name, piece({f"runs/{name}/{path.name}": path for path in files}))
-        frames = json.loads(folder.summary.read_text())["frames"]
-        said = "no room for it in the packs" if name in pack.left_out else f"packed, {frames:,} frames"
-        say(f"{name}: {said}")
-    except (OSError, ValueError, KeyError) as error:
+        pack.add(name, piece({f"{top}/{name}/{path.name}": path for path in files}))
+        say(f"{name}: {'no room for it in the packs' if name in pack.left_out else f'packed in {top}'}")
+    except OSError as error:
         say(f"{name}: not packed, {type(error).__name__}: {error}")
 
 
