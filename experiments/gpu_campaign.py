@@ -96,7 +96,7 @@ def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, required=True, help="of the machine; all is over by then")
     parser.add_argument("--out", type=Path, required=True, help="folder of the archives")
-    parser.add_argument("--work", type=Path, default=Path("outputs/gpu_campaign"), help="folder of the runs themselves")
+    parser.add_argument("--work", type=Path, help="folder of the runs; by default outputs/gpu_campaign/<OUT's name>")
     parser.add_argument("--grid", help="name of a grid in conf/grids")
     parser.add_argument("--jobs", type=int, default=3, help="cells at once on each GPU")
     parser.add_argument("--done", type=Path, nargs="*", default=[], help="folders whose finished cells are left out")
@@ -111,6 +111,7 @@ def arguments() -> argparse.Namespace:
     options = parser.parse_args()
     if options.minutes <= 0 or options.jobs < 1:
         parser.error("minutes must be above 0 and jobs at least 1")
+    options.work = options.work or Path("outputs/gpu_campaign") / options.out.name
     options.first = ["experiment=gpu", f"device={options.device}"]
     if not options.grid and not any(one.partition("=")[0] in ("algo", "task") for one in options.settings):
         options.settings = [*CELLS, *options.settings]

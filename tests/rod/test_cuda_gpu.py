@@ -1,7 +1,7 @@
 """The CUDA kernel on a GPU; skipped where there is none.
 
-A kernel is compiled for each number of elements, precision and contact model, which takes about 5 s; the CPU's kernel is
-too, and takes longer. So tests share variants, and what needs one of its own is held against the PyTorch backend.
+A kernel is compiled for each number of elements, precision and contact model, which takes about 5 s; the CPU's kernel
+is too, and takes longer. So tests share variants, and what needs one of its own is held against the PyTorch backend.
 """
 
 from functools import cache

@@ -1,12 +1,15 @@
 """Which cells a campaign begins, with how much time each, and what it takes for done."""
 
+import json
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
 from made_up_runs import write_run
+from softgm_bench.config import compose, plain
 from softgm_bench.errors import UserError
 from softgm_bench.sweeps import campaign
 from softgm_bench.sweeps.packing import Pack
@@ -73,6 +76,43 @@ def test_without_time_no_cell_begins_and_all_are_named(tmp_path):
     assert not (tmp_path / "runs").exists()
 
 
+ANSWERING = "import json, sys; print(json.dumps({'outcome': sys.argv[1], 'line': 'in a word'}))"
+
+
+def test_a_failed_cell_leaves_its_last_lines_in_the_log_and_stops_no_other(tmp_path, monkeypatch):
+    def start(values, overrides, cwd, number):
+        folder = Path(values["run_dir"])
+        folder.mkdir(parents=True)
+        (folder / "output.log").write_text("".join(f"line {k}\n" for k in range(100)))
+        outcome = "failed" if values["seed"] == 0 else "interrupted"
+        return subprocess.Popen([sys.executable, "-c", ANSWERING, outcome], stdout=subprocess.PIPE, text=True)
+
+    monkeypatch.setattr(campaign.sweep_cell, "start", start)
+    cells = {f"basic/softgm/seed{seed}": [f"seed={seed}"] for seed in (0, 1)}
+    said = []
+    work = campaign.Campaign(cells, tmp_path / "runs", time.monotonic() + 600.0, jobs=1)
+    campaign.run(work, Pack(tmp_path / "out"), said.append)
+    at = said.index("basic/softgm/seed0: failed, in a word")
+    assert said[at + 1 : at + 1 + campaign.TAIL] == [f"    line {k}" for k in range(100 - campaign.TAIL, 100)]
+    assert said[-1] == "basic/softgm/seed1: interrupted, in a word"
+
+
+def test_finished_runs_in_the_way_are_packed_if_they_are_the_campaigns_own_and_never_done_again(tmp_path, monkeypatch):
+    monkeypatch.setattr(campaign.sweep_cell, "start", lambda *_: pytest.fail("it was begun"))
+    cells = {f"basic/softgm/seed{seed}": [f"seed={seed}", "task=basic"] for seed in (0, 1)}
+    for seed, gamma in ((0, 0.95), (1, 0.5)):
+        folder = write_run(tmp_path / "runs", "basic", "softgm", seed)
+        config = plain(compose(["task=basic", f"seed={seed}", f"algo.gamma={gamma}", "experiment.minutes=3"]))
+        (folder / "config.yaml").write_text(json.dumps(config))
+        (folder / campaign.POLICY).write_bytes(b"policy")
+    said = []
+    pack = Pack(tmp_path / "out")
+    campaign.run(campaign.Campaign(cells, tmp_path / "runs", time.monotonic() + 600.0, jobs=1), pack, said.append)
+    assert pack.names == ["basic/softgm/seed0"]
+    assert said[1].startswith("basic/softgm/seed1: ")
+    assert said[1].endswith("holds a run with another algo.gamma; choose another --work")
+
+
 def test_processes_are_stopped_all_at_once_also_those_that_will_not():
     stubborn = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print(flush=True); time.sleep(60)"
     children = [
@@ -81,6 +121,7 @@ def test_processes_are_stopped_all_at_once_also_those_that_will_not():
     ]
     for child in children:
         child.stdout.readline()
+    children[2].wait()
     began = time.monotonic()
     campaign.stop(children, patience=1.0)
     assert time.monotonic() - began < 5.0

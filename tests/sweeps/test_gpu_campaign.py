@@ -115,7 +115,7 @@ def test_a_signal_stops_the_trainings_and_keeps_what_they_had(tmp_path):
 @pytest.mark.slow
 def test_endless_cells_end_in_time_with_their_summaries_and_a_failing_one_says_why(tmp_path):
     settings = [*SMALL, "experiment.total_frames=100_000_000", "seed=0", "perturbation=none,section_failure"]
-    broken = "perturbation.failed_agents=[77]"  # of the one that has such agents; the other one's are too
+    broken = ("perturbation=section_failure", "perturbation.failed_agents=[77]")
     began = time.monotonic()
     process = start(tmp_path, "--only-cells", *settings, minutes=1.5)
     output, _ = process.communicate(timeout=300)
@@ -127,9 +127,9 @@ def test_endless_cells_end_in_time_with_their_summaries_and_a_failing_one_says_w
         assert 0 < summary["frames"] < 100_000_000
     assert "basic/mappo/seed0" in campaign.finished(held)
 
-    failing = start(tmp_path / "failing", "--only-cells", *SMALL, broken)
+    failing = start(tmp_path / "failing", "--only-cells", *SMALL, *broken)
     output, _ = failing.communicate(timeout=300)
-    assert "basic/mappo/seed0: failed, perturbation.failed_agents" in output
+    assert "basic/mappo_section_failure/seed0: failed, perturbation.failed_agents" in output
 
 
 @pytest.mark.slow

@@ -17,6 +17,7 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from softgm_bench.config import available_threads, compose_untyped
+from softgm_bench.config.comparison import ABSENT, differences
 from softgm_bench.errors import UserError
 from softgm_bench.storage.run_folder import RunFolder
 from softgm_bench.sweeps import cell as sweep_cell
@@ -106,11 +107,7 @@ def run(campaign: Campaign, pack: Pack, say: Say) -> None:
         pack: receives each cell when it has finished.
         say: takes lines for the log.
     """
-    waiting = list(campaign.cells)
-    for name in [name for name in waiting if RunFolder(campaign.work / name).summary.exists()]:
-        waiting.remove(name)  # of this campaign, before it was killed
-        _keep(campaign, name, pack, say)
-    number = 0
+    waiting, number = _without_finished(campaign, pack, say), 0
     try:
         while waiting or campaign.running:
             while waiting and len(campaign.running) < campaign.jobs:
@@ -132,6 +129,9 @@ def run(campaign: Campaign, pack: Pack, say: Say) -> None:
         for name, child in campaign.running.items():  # some may have just finished
             _end(campaign, name, child, pack, say)
         campaign.running.clear()
+        for name in campaign.cells:  # one that a signal came between, or one that has finished while it was stopped
+            if name not in pack.names and RunFolder(campaign.work / name).summary.exists():
+                _keep(campaign, name, pack, say)
 
 
 def stop(children: Sequence[subprocess.Popen] | Any, patience: float = 10.0) -> None:
@@ -148,12 +148,39 @@ def stop(children: Sequence[subprocess.Popen] | Any, patience: float = 10.0) -> 
             child.wait()
 
 
+def _without_finished(campaign: Campaign, pack: Pack, say: Say) -> list[str]:
+    """Pack what this campaign had finished before it was killed; the names of the other cells.
+
+    Finished runs with other settings are another campaign's: they are left alone and not done again.
+    """
+    waiting = []
+    for name, overrides in list(campaign.cells.items()):
+        folder = RunFolder(campaign.work / name)
+        if not folder.summary.exists():
+            waiting.append(name)
+            continue
+        held: Any = OmegaConf.to_container(OmegaConf.load(folder.config))
+        changed = [key for key, pair in differences(_values(overrides), held).items() if ABSENT not in pair]
+        if changed:
+            say(f"{name}: {folder.path} holds a run with another {changed[0]}; choose another --work")
+            del campaign.cells[name]
+        else:
+            _keep(campaign, name, pack, say)
+    return waiting
+
+
+def _values(overrides: list[str]) -> dict[str, Any]:
+    """All settings of a cell as plain values."""
+    values: Any = OmegaConf.to_container(compose_untyped(overrides), resolve=True)
+    return values
+
+
 def _least(campaign: Campaign) -> float:
     return 60.0 * campaign.least_minutes + campaign.start_up
 
 
 def _begin(campaign: Campaign, name: str, minutes: float, number: int, say: Say) -> None:
-    composed: Any = OmegaConf.to_container(compose_untyped(campaign.cells[name]), resolve=True)
+    composed = _values(campaign.cells[name])
     composed["experiment"]["minutes"] = minutes
     composed |= {"run_dir": str((campaign.work / name).absolute()), "resume": True, "overwrite": False}
     composed["threads"] = composed["threads"] or max(1, available_threads() // campaign.jobs)

@@ -39,12 +39,14 @@ class Pack:
     Number 0 holds what changes, such as a log; a piece that was added elsewhere stays where it is.
 
     Attributes:
-        left_out: names of pieces for which there was no room.
+        names: of the pieces that have come.
+        left_out: names of those for which there was no room.
     """
 
     def __init__(self, folder: Path, files: int = FILES, file_bytes: int = FILE_BYTES) -> None:
         """Make the folder; archives in it are replaced as pieces come."""
         folder.mkdir(parents=True, exist_ok=True)
+        self.names: list[str] = []
         self.left_out: list[str] = []
         self._folder, self._most = folder, file_bytes
         self._parts: list[list[bytes]] = [[] for _ in range(files - 1)]
@@ -59,8 +61,10 @@ class Pack:
             if _size(part) + len(content) <= self._most:
                 part.append(content)
                 self._write(number, part)
-                return
-        self.left_out.append(name)
+                break
+        else:
+            self.left_out.append(name)
+        self.names.append(name)
 
     def put(self, content: bytes) -> None:
         """Replace what changes.
