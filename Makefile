@@ -3,7 +3,7 @@ PYTHON ?= python3.11
 BIN := .venv/bin
 STAMP := .venv/.setup
 
-.PHONY: setup train test test-all check bench bench-gpu parity validation peers peers-setup report pictures docs
+.PHONY: setup setup-gpu train test test-all test-gpu check bench bench-gpu gpu-campaign parity validation peers peers-setup report pictures docs
 
 setup: $(STAMP)
 
@@ -42,10 +42,33 @@ bench: setup
 	$(BIN)/python benchmarks/bench_models.py
 	$(BIN)/python benchmarks/bench_training.py
 
-# The same on an NVIDIA GPU.
-bench-gpu: setup
+# On an NVIDIA GPU. Where PYTHON is given, as in `make test-gpu PYTHON=python3`, that interpreter is used as it is: nothing
+# is installed and no network is needed.
+ifneq ($(filter command environment,$(firstword $(origin PYTHON))),)
+GPU_PYTHON := PYTHONPATH=src $(PYTHON)
+setup-gpu:
+else
+GPU_PYTHON := PYTHONPATH=src $(BIN)/python
+setup-gpu: setup
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[cuda]'
-	$(BIN)/python benchmarks/bench_gpu.py
+endif
+
+# The tests that are marked for GPUs; skipped without one.
+test-gpu: setup-gpu
+	$(GPU_PYTHON) -m pytest -m gpu --durations=10 $$(grep -rl --include='test_*.py' 'pytest.mark.gpu' tests)
+
+# What one GPU does: BENCH=--short for a minute, BENCH='--device cpu --batches 4 --short' for a rehearsal.
+bench-gpu: setup-gpu
+	$(GPU_PYTHON) benchmarks/bench_gpu.py $(BENCH)
+
+# So many minutes of a GPU used whole; OUT receives at most six archives. CELLS are settings as in a sweep,
+# CAMPAIGN other options; docs/gpu.md.
+MINUTES ?= 10
+JOBS ?= 3
+gpu-campaign: setup-gpu
+	$(if $(OUT),,$(error give OUT, the folder of the archives))
+	$(GPU_PYTHON) experiments/gpu_campaign.py --minutes $(MINUTES) --out $(OUT) --jobs $(JOBS) \
+		$(if $(GRID),--grid $(GRID)) $(if $(DONE),--done $(DONE)) $(CAMPAIGN) -- $(CELLS)
 
 # Trust: every case of the parity suite as a table; solutions in closed form, energy, order in time, float32.
 parity: setup

@@ -40,7 +40,7 @@ def test_a_finished_run_is_done_with_its_success_and_interval(tmp_path):
 
 def test_a_run_is_running_while_a_process_locks_its_folder_and_stopped_when_that_was_killed(tmp_path):
     folder = begun(tmp_path / "run")
-    (folder / "running.json").write_text(json.dumps({"pid": 4711, "host": "node3"}))
+    (folder / "running.json").write_text(json.dumps({"pid": 4711, "host": "node3", "device": "cuda:1"}))
     holder = subprocess.Popen(
         [sys.executable, "-c", HOLD, str(folder)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )
@@ -49,7 +49,7 @@ def test_a_run_is_running_while_a_process_locks_its_folder_and_stopped_when_that
     holder.kill()
     holder.communicate()
 
-    assert held == sweep_record.State("running", "process 4711 on node3, 200 frames, 20%")
+    assert held == sweep_record.State("running", "process 4711 on node3 cuda:1, 200 frames, 20%")
     assert sweep_record.state(folder) == sweep_record.State("stopped", "200 frames, 20%")
 
 
@@ -72,9 +72,10 @@ def test_a_failure_is_told_until_the_next_attempt_begins(tmp_path):
     folder = tmp_path / "run"
     sweep_record.write_failure(folder, "seed=-1: a seed is a whole number")
     assert sweep_record.state(folder) == sweep_record.State("failed", "seed=-1: a seed is a whole number")
-    with sweep_record.running(folder):
+    with sweep_record.running(folder, "cuda:2"):
         assert not (folder / "failure.json").exists()
         assert json.loads((folder / "running.json").read_text())["pid"] == os.getpid()
+        assert json.loads((folder / "running.json").read_text())["device"] == "cuda:2"
     assert list(folder.iterdir()) == []
 
 

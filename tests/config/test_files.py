@@ -20,17 +20,17 @@ def test_every_file_sets_a_value(file):
 
 
 def test_there_are_few_files_and_each_stands_in_a_group():
-    assert len(FILES) <= 45
+    assert len(FILES) <= 46
     groups = {file.relative_to(config_directory()).parts[0] for file in FILES} - {"config.yaml"}
     assert groups == {"task", "model", "algo", "experiment", "recipe", "perturbation", "logger", "grids"}
     defaults = OmegaConf.load(config_directory() / "config.yaml").defaults
     assert all("optional" not in str(entry) and "$" not in str(entry) for entry in defaults)
 
 
-@pytest.mark.parametrize("experiment", ["default", "quick", "smoke"])
+@pytest.mark.parametrize("experiment", ["default", "quick", "smoke", "gpu"])
 @pytest.mark.parametrize("task", TASK_CONFIGS)
 def test_every_combination_of_files_is_valid(task, experiment):
-    config = configure([f"task={task}", f"experiment={experiment}", "seed=3"])
+    config = configure([f"task={task}", f"experiment={experiment}", "seed=3", "device=cpu"])
 
     assert type(config.task) is TASK_CONFIGS[task]
     assert config.run_dir == f"outputs/{task}/softgm/seed3"
@@ -66,6 +66,36 @@ def test_a_smoke_run_is_small_and_takes_gradient_steps_whatever_the_recipe(algo,
         learning = config.experiment.total_frames - max(config.algo.random_frames, frames)
         assert learning * config.algo.updates_per_frame >= 2
         assert config.algo.batch_size <= frames
+
+
+@pytest.mark.parametrize("recipe", ["paper", "tuned"])
+@pytest.mark.parametrize("algo", algorithm_configs())
+@pytest.mark.parametrize("task", ["basic", "wall"])
+def test_a_gpu_run_is_valid_without_a_gpu_and_large_everywhere(task, algo, recipe):
+    config = configure([f"task={task}", f"algo={algo}", f"recipe={recipe}", "experiment=gpu", "device=cpu"])
+    usual = compose([f"task={task}", f"algo={algo}", f"recipe={recipe}"])
+
+    assert (config.device, config.dtype, config.backend) == ("cpu", "float32", None)
+    frames = config.experiment.num_envs * config.experiment.steps_per_batch
+    if hasattr(config.algo, "updates_per_frame"):
+        used, usually = (one.algo.batch_size * one.algo.updates_per_frame for one in (config, usual))
+        assert frames * config.algo.updates_per_frame >= 1  # a gradient step in every iteration
+        assert 0.8 < used / usually < 2.0  # as often is a frame learnt from
+    else:
+        assert frames % config.algo.minibatch_size == 0
+        assert frames // config.algo.minibatch_size >= 4
+    evaluation = config.experiment.evaluation
+    steps = config.experiment.total_frames / config.experiment.num_envs  # of the simulator
+    looks = config.experiment.total_frames // evaluation.interval
+    assert looks * evaluation.horizon * evaluation.episodes < 0.05 * config.experiment.total_frames
+    assert looks * evaluation.horizon < 0.2 * steps  # which are half of the time, and take longer
+
+
+def test_only_a_gpu_run_chooses_a_gpu():
+    assert (compose(["experiment=gpu"]).device, compose(["experiment=gpu"]).dtype) == ("cuda", "float32")
+    for experiment in ("default", "quick", "smoke"):
+        config = compose([f"experiment={experiment}"])
+        assert (config.device, config.dtype) == ("cpu", "float64")
 
 
 def test_softgm_is_ppo_with_the_papers_settings():

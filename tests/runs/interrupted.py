@@ -11,6 +11,7 @@ from pathlib import Path
 import torch
 
 from softgm_bench.runs import checkpoint
+from softgm_bench.runs.ending import REHEARSAL
 from softgm_bench.storage.run_folder import RunFolder
 
 TINY = (
@@ -44,7 +45,8 @@ def start(*overrides, dying=None, file_size=None):
     Args:
         overrides: of its settings.
         dying: ``(name, before)``: it kills itself when a file of this name's beginning has been written beside its
-            place and is about to be put there, or, unless ``before``, right after that.
+            place and is about to be put there, or, unless ``before``, right after that. The rehearsal's files count
+            under ``.rehearsal/`` alone.
         file_size: bytes that no file may exceed.
     """
     process = _context.Process(target=_train, args=(overrides, dying, file_size))
@@ -62,7 +64,8 @@ def _train(overrides, dying, file_size):
         replace = os.replace
 
         def replace_or_die(source, target):
-            fatal = Path(target).name.startswith(name)
+            rehearsed = f"{REHEARSAL}/" if REHEARSAL in Path(target).parts else ""
+            fatal = f"{rehearsed}{Path(target).name}".startswith(name)
             if not (fatal and before):
                 replace(source, target)
             if fatal:

@@ -59,6 +59,11 @@ def test_metrics_repeat_with_the_seed_however_often_training_is_looked_at(tmp_pa
     assert all(one["episode_return"] != another["episode_return"] for one, another in zip(first, other, strict=True))
 
 
+def test_a_run_without_loggers_of_others_warns_of_none(tmp_path, capsys):
+    trained(tmp_path)
+    assert "stopped" not in capsys.readouterr().err
+
+
 def test_a_perturbation_acts_in_training_too_and_its_state_is_kept(tmp_path):
     plain = trained(tmp_path / "plain", "task=wall")
     noisy = trained(tmp_path / "noisy", "task=wall", "perturbation=noise")

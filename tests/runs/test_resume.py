@@ -17,7 +17,7 @@ from interrupted import PPO, SMALL, TINY, differences, start, state, written
 
 from softgm_bench.config import compose
 from softgm_bench.errors import UserError
-from softgm_bench.runs import checkpoint, loop
+from softgm_bench.runs import checkpoint, ending, loop
 from softgm_bench.runs.interruption import Interrupted
 from softgm_bench.runs.metrics import CsvWriter
 from softgm_bench.storage.run_folder import RunFolder
@@ -174,7 +174,7 @@ def test_an_evaluation_that_a_signal_broke_off_is_made_up_for(tmp_path, whole, m
         raise Interrupted(signal.SIGTERM)
 
     with monkeypatch.context() as patch:
-        patch.setattr(loop, "_evaluate", interrupted)
+        patch.setattr(ending, "play", interrupted)
         with pytest.raises(Interrupted, match="after 48 frames, resume=true resumes it"):
             train(tmp_path, *SMALL)
     train(tmp_path, *SMALL, "resume=true")
@@ -211,6 +211,7 @@ def test_it_may_be_killed_at_the_worst_moments(tmp_path, whole):
     moments = [
         ("config.yaml", True),  # before there is a run
         ("config.yaml", False),
+        (".rehearsal/summary.json", True),  # while the end is rehearsed
         ("frames-000000000032", True),  # before its first checkpoint is in place
         ("frames-000000000064", True),  # with another behind it
         ("frames-000000000096", False),  # before older ones are removed
@@ -334,11 +335,11 @@ def test_a_run_whose_disk_was_full_goes_on_where_there_is_room_again(tmp_path, w
     assert written(tmp_path / "copy") == written(whole)
 
 
-def test_a_file_that_may_not_grow_ends_the_run_in_the_same_way(tmp_path, whole):
+def test_where_no_checkpoint_can_be_written_a_run_ends_before_it_trains(tmp_path, whole):
     process = start(*SMALL, f"run_dir={tmp_path}", file_size=20_000)
     process.join(120)
     assert process.exitcode == 1
-    assert (tmp_path / "metrics.csv").read_text().count("\n") == 3
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["checkpoints", "config.yaml"]
     assert not list((tmp_path / "checkpoints").iterdir())
 
     train(tmp_path, *SMALL, "resume=true")

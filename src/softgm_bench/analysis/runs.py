@@ -119,7 +119,7 @@ def find(*roots: Path) -> Found:
         if not root.is_dir():
             raise UserError(f"{root}: no such folder")
         for path, folders, files in os.walk(root.resolve()):
-            folders[:] = sorted(name for name in folders if name != "checkpoints")
+            folders[:] = sorted(name for name in folders if name != "checkpoints" and not name.startswith("."))
             if {"summary.json", "config.yaml", "metrics.csv", "episodes.csv"} & set(files):
                 source = _read(RunFolder(Path(path)), Path(path).relative_to(root.resolve().parent).as_posix())
                 lists[type(source)].append(source)

@@ -33,6 +33,8 @@ def validate(config: Config) -> None:
     for key, value in at_least_one.items():
         if value is not None and value < 1:
             raise UserError(f"{key}={value}: it must be at least 1")
+    if experiment.minutes is not None and not experiment.minutes > 0.0:
+        raise UserError(f"experiment.minutes={experiment.minutes}: it must be above 0, or null")
     if not config.run_dir:
         raise UserError("run_dir is empty: name a folder for the run")
     if config.observation not in OBSERVATIONS:

@@ -13,6 +13,7 @@ FREE = (
     "experiment.checkpoint",
     "recipe",
     "experiment.name",
+    "experiment.minutes",
     "task.train_horizon",
     "task.hidden_scene",
 )

@@ -11,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from softgm_bench.config.schema import PAPER, labelled
 
-SMOKE = "smoke"
+SMOKE, GPU = "smoke", "gpu"
 
 
 def tuned_or_paper(tuned: Any, paper: Any, *, _root_: DictConfig) -> Any:
@@ -27,6 +27,11 @@ def on_or_off_policy(on: Any, off: Any, *, _root_: DictConfig) -> Any:
 def in_smoke(smoke: Any, otherwise: Any, *, _root_: DictConfig) -> Any:
     """The first value with ``experiment=smoke``, the second with every other experiment."""
     return _node(smoke if OmegaConf.select(_root_, "experiment.name") == SMOKE else otherwise)
+
+
+def in_gpu(gpu: Any, otherwise: Any, *, _root_: DictConfig) -> Any:
+    """The first value with ``experiment=gpu``, the second with every other experiment."""
+    return _node(gpu if OmegaConf.select(_root_, "experiment.name") == GPU else otherwise)
 
 
 def first(*values: Any) -> Any:
@@ -46,5 +51,5 @@ def _node(value: Any) -> Any:
 
 def register() -> None:
     """Let YAML call the functions above by their names."""
-    for resolver in (tuned_or_paper, on_or_off_policy, in_smoke, first, label):
+    for resolver in (tuned_or_paper, on_or_off_policy, in_smoke, in_gpu, first, label):
         OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)

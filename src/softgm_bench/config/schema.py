@@ -39,6 +39,7 @@ class ExperimentConfig:
 
     name: str
     total_frames: int
+    minutes: float | None
     num_envs: int
     steps_per_batch: int
     train_horizon: int | None

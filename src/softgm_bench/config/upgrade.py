@@ -9,6 +9,7 @@ NEUTRAL: dict[str, Any] = {
     "recipe": "",
     "resume": False,
     "experiment.name": "",
+    "experiment.minutes": None,
     "task.train_horizon": None,
     "task.hidden_scene": False,
 }

@@ -12,10 +12,11 @@ from tensordict import TensorDictBase
 
 from softgm_bench.assembly import build_algorithm, build_env
 from softgm_bench.config import Config, plain
-from softgm_bench.episodes.evaluation import DISCOUNT, EpisodeRecords, evaluate
+from softgm_bench.episodes.evaluation import EpisodeRecords
 from softgm_bench.episodes.summary import summarise, table
 from softgm_bench.errors import UserError
-from softgm_bench.runs import checkpoint, folder, resume
+from softgm_bench.runs import checkpoint, ending, folder, resume
+from softgm_bench.runs.budget import Budget
 from softgm_bench.runs.interruption import Interrupted, Interruption
 from softgm_bench.runs.loggers.guarded import Loggers
 from softgm_bench.runs.loggers.video import episode_video
@@ -23,9 +24,8 @@ from softgm_bench.runs.machine import keep_memory, set_threads
 from softgm_bench.runs.metrics import CsvWriter, EpisodeTracker, step_metrics
 from softgm_bench.runs.progress import Progress
 from softgm_bench.runs.run import Run, derive_seeds, frames_per_iteration, total_frames
-from softgm_bench.storage.files import to_json, write_atomically
+from softgm_bench.storage.files import to_json
 from softgm_bench.storage.run_folder import RunFolder
-from softgm_bench.storage.versions import versions
 from softgm_bench.upstream.collector import FrameCollector
 
 
@@ -45,6 +45,7 @@ def train(config: Config) -> dict[str, Any]:
     try:
         with folder.exclusive(config.run_dir):
             _begin(run)
+            ending.rehearse(run)
             with Loggers(config, run.folder.path, run.frames) as run.loggers:
                 records = _go(run)
                 return _finish(run, records)
@@ -66,7 +67,7 @@ def _go(run: Run) -> EpisodeRecords:
             progress.say(f"final evaluation: {settings.final_episodes} episodes")
             with interruption.at_once():
                 seed = run.seeds.final_evaluation
-                return _evaluate(run, settings.final_episodes, seed, settings.final_horizon)
+                return ending.play(run, settings.final_episodes, seed, settings.final_horizon)
         except Interrupted as stop:
             stop.args = (f"interrupted after {run.frames} frames, resume=true resumes it; checkpoint: {_save(run)}",)
             raise
@@ -74,7 +75,7 @@ def _go(run: Run) -> EpisodeRecords:
 
 def _build(config: Config) -> Run:
     """A run at its beginning; nothing is written yet."""
-    started = time.perf_counter()
+    started, budget = time.perf_counter(), Budget(config.experiment.minutes)
     seeds = derive_seeds(config.seed)
     set_threads(config.threads)
     keep_memory()
@@ -84,7 +85,7 @@ def _build(config: Config) -> Run:
     algorithm = build_algorithm(config, env)
     collector = FrameCollector(env, algorithm.policy, frames_per_iteration(config))
     episodes = EpisodeTracker(experiment.num_envs, config.device)
-    return Run(config, RunFolder(Path(config.run_dir)), seeds, env, algorithm, collector, episodes, started)
+    return Run(config, RunFolder(Path(config.run_dir)), seeds, env, algorithm, collector, episodes, started, budget)
 
 
 def _begin(run: Run) -> None:
@@ -111,6 +112,11 @@ def _learn(run: Run, interruption: Interruption, progress: Progress) -> None:
             run.loggers.metrics(row)
             progress.advance(batch.numel(), row.get("success_rate", math.nan))
             interruption.check()
+            run.budget.lap()
+            if run.budget.is_short(ending.final_steps(run)):
+                minutes = experiment.minutes
+                progress.say(f"experiment.minutes={minutes}: training stops here, after {run.frames} frames")
+                return
             _evaluate_if_due(run, interruption, progress)
             if _crossed(experiment.checkpoint.interval, run.frames, batch.numel()):
                 _save(run)
@@ -141,18 +147,12 @@ def _row(run: Run, batch: TensorDictBase, losses: dict[str, float], seconds: flo
     }
 
 
-def _evaluate(run: Run, episodes: int, seed: int, horizon: int | None) -> EpisodeRecords:
-    env = build_env(run.config, episodes, seed, horizon)
-    deterministic = run.config.experiment.evaluation.deterministic
-    return evaluate(run.algorithm.policy, env, deterministic=deterministic, seed=seed)
-
-
 def _evaluate_if_due(run: Run, interruption: Interruption, progress: Progress) -> None:
     if run.evaluations == run.evaluations_due:
         return
     with interruption.at_once():
         settings = run.config.experiment.evaluation
-        records = _evaluate(run, settings.episodes, run.seeds.evaluation, settings.horizon)
+        records = ending.play(run, settings.episodes, run.seeds.evaluation, settings.horizon)
     run.evaluations += 1
     metrics = summarise(records)
     at = {"evaluation": run.evaluations, "iteration": run.iteration, "frames": run.frames, "wall_time": run.wall_time}
@@ -173,25 +173,8 @@ def _save(run: Run) -> Path:
 
 def _finish(run: Run, records: EpisodeRecords) -> dict[str, Any]:
     config = run.config
-    with CsvWriter(run.folder.episodes) as episodes:
-        for row in records.rows():
-            episodes.write(row)
-    metrics = summarise(records)
-    summary = {
-        "task": config.task.name,
-        "algo": config.label,
-        "model": plain(config)["model"]["name"],
-        "observation": config.observation,
-        "seed": config.seed,
-        "frames": run.frames,
-        "wall_time": run.wall_time,
-        "threads": torch.get_num_threads(),
-        "discount": DISCOUNT,
-        "deterministic": config.experiment.evaluation.deterministic,
-        "final_evaluation": metrics,
-        "versions": versions(),
-    }
-    write_atomically(run.folder.summary, (to_json(summary, indent=2) + "\n").encode())
+    summary = ending.write(run, run.folder, records)
+    metrics = summary["final_evaluation"]
     print(table(metrics, f"{config.label} on {config.task.name}, seed {config.seed}, {run.frames} frames:"))
     print(f"run folder: {run.folder.path}")
     video = partial(episode_video, config, run.algorithm.policy, run.env.sizes, run.frames)

@@ -10,6 +10,7 @@ from tensordict import TensorDict
 from softgm_bench.algorithms import Algorithm
 from softgm_bench.config import Config, plain
 from softgm_bench.runs import checkpoint
+from softgm_bench.runs.budget import Budget
 from softgm_bench.runs.loggers.guarded import Loggers
 from softgm_bench.runs.metrics import EpisodeTracker
 from softgm_bench.storage.run_folder import RunFolder
@@ -33,6 +34,7 @@ class Run:
     Attributes:
         env: an ``Environment``.
         started: when it would have begun if it had never been interrupted, on the clock of ``time.perf_counter``.
+        budget: of this process's time.
         frames: control steps of single environments that the policy has learnt from.
         evaluations: made so far.
     """
@@ -45,6 +47,7 @@ class Run:
     collector: FrameCollector
     episodes: EpisodeTracker
     started: float
+    budget: Budget
     iteration: int = 0
     frames: int = 0
     evaluations: int = 0

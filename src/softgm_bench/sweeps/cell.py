@@ -31,6 +31,7 @@ from softgm_bench.config.explain import USER_ERRORS, explain
 from softgm_bench.config.upgrade import upgraded
 from softgm_bench.storage.files import to_json, write_atomically
 from softgm_bench.storage.run_folder import RunFolder
+from softgm_bench.sweeps import devices
 from softgm_bench.sweeps import record as sweep_record
 
 RECORDS = "SOFTGM_SWEEP"  # environment variable: the folder where outcomes go
@@ -54,7 +55,7 @@ def run(composed: DictConfig) -> str:
     try:
         values: Any = OmegaConf.to_container(composed, resolve=True)
         run_dir = values["run_dir"]
-        outcome = _do(values, overrides, cwd)
+        outcome = _do(values, overrides, cwd, hydra.job.num)
     except KeyboardInterrupt:
         _leave(hydra.job.num, run_dir, overrides, {"outcome": INTERRUPTED, "line": "interrupted"})
         raise
@@ -83,7 +84,7 @@ def finished(values: Mapping[str, Any], run_dir: Path) -> str:
         return ""
 
 
-def _do(values: dict[str, Any], overrides: list[str], cwd: Path) -> dict[str, str]:
+def _do(values: dict[str, Any], overrides: list[str], cwd: Path, number: int) -> dict[str, str]:
     run_dir = cwd / values["run_dir"]
     state = sweep_record.state(run_dir)
     if state.kind == sweep_record.RUNNING:
@@ -94,20 +95,47 @@ def _do(values: dict[str, Any], overrides: list[str], cwd: Path) -> dict[str, st
             return {"outcome": SKIPPED, "line": f"finished before, {achieved}"}
         values["resume"] = True
     began = time.monotonic()
-    outcome = _train_apart(values, overrides, cwd)
+    outcome = _train_apart(values, overrides, cwd, number)
     if outcome["outcome"] == DONE:
         outcome["line"] += f", {(time.monotonic() - began) / 60:.1f} min"
     return outcome
 
 
-def _train_apart(values: Mapping[str, Any], overrides: list[str], cwd: Path) -> dict[str, str]:
+def _train_apart(values: Mapping[str, Any], overrides: list[str], cwd: Path, number: int) -> dict[str, str]:
     """Start the training and wait for it; it stops with this process or with the one that this is a worker of."""
-    environment = dict(os.environ)
+    child = start(values, overrides, cwd, number)
+    try:
+        while True:
+            try:
+                answer, _ = child.communicate(timeout=POLL)
+                break
+            except subprocess.TimeoutExpired:
+                pass
+            _leave_if_orphaned(child)
+    except BaseException:
+        _stop(child)
+        raise
+    return outcome(answer, child.returncode, Path(values["run_dir"]))
+
+
+def start(values: Mapping[str, Any], overrides: list[str], cwd: Path, number: int) -> subprocess.Popen:
+    """Start a training in a process of its own, which stops with this one.
+
+    Args:
+        values: of all settings, plain.
+        overrides: that led to them, for messages.
+        cwd: what relative run folders are relative to.
+        number: of the job, by which GPUs are dealt out.
+
+    Returns:
+        The process; what it prints is for ``outcome``.
+    """
+    device, visible = devices.dealt(values["device"], number, os.environ)
+    environment = dict(os.environ) | visible
     if values["threads"]:
         environment |= dict.fromkeys(THREADS, str(values["threads"]))
-    command = [sys.executable, "-m", "softgm_bench.sweeps.cell"]
     child = subprocess.Popen(
-        command,
+        [sys.executable, "-m", "softgm_bench.sweeps.cell"],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
@@ -115,22 +143,15 @@ def _train_apart(values: Mapping[str, Any], overrides: list[str], cwd: Path) -> 
         env=environment,
         start_new_session=True,  # Ctrl-C in a terminal reaches this process, which passes it on
     )
-    text: str | None = json.dumps({"config": values, "overrides": overrides, "parent": os.getpid()})
-    try:
-        while True:
-            try:
-                answer, _ = child.communicate(text, timeout=POLL)
-                break
-            except subprocess.TimeoutExpired:
-                text = None
-            _leave_if_orphaned(child)
-    except BaseException:
-        _stop(child)
-        raise
-    return _outcome(answer, child.returncode, Path(values["run_dir"]))
+    assert child.stdin is not None
+    job = {"config": values, "overrides": overrides, "parent": os.getpid(), "device": device}
+    with suppress(BrokenPipeError), child.stdin as pipe:  # it may have died already, which its status tells
+        pipe.write(json.dumps(job))
+    child.stdin = None
+    return child
 
 
-def _outcome(answer: str, status: int, run_dir: Path) -> dict[str, str]:
+def outcome(answer: str, status: int, run_dir: Path) -> dict[str, str]:
     """Give what the training said last; if it said nothing, what became of its process."""
     try:
         return json.loads(answer.splitlines()[-1])
@@ -175,12 +196,12 @@ def main() -> int:
     job = json.loads(sys.stdin.read())
     _stop_with(job["parent"])
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "w")
-    answer = _train(job["config"], job["overrides"])
+    answer = _train(job["config"], job["overrides"], job["device"])
     print(json.dumps(answer), file=answers, flush=True)
     return 0
 
 
-def _train(values: Mapping[str, Any], overrides: list[str]) -> dict[str, str]:
+def _train(values: Mapping[str, Any], overrides: list[str], device: str) -> dict[str, str]:
     try:
         config = typed(OmegaConf.create(dict(values)))
         from softgm_bench.assembly import check  # late, as all that brings torch along
@@ -189,7 +210,7 @@ def _train(values: Mapping[str, Any], overrides: list[str]) -> dict[str, str]:
         from softgm_bench.runs.loop import train
 
         run_dir = Path(config.run_dir)
-        with sweep_record.running(run_dir), _logged(run_dir / LOG):
+        with sweep_record.running(run_dir, device), _logged(run_dir / LOG):
             try:
                 return {"outcome": DONE, "line": sweep_record.achieved(train(config))}
             except Exception as error:  # a sweep goes on, whatever happened to one cell

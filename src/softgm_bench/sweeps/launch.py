@@ -24,6 +24,7 @@ from omegaconf import DictConfig
 from softgm_bench.config import available_threads, composing, config_directory
 from softgm_bench.errors import UserError
 from softgm_bench.sweeps import cell as sweep_cell
+from softgm_bench.sweeps import devices
 
 JOBLIB, LOCAL, SLURM, RAY = "joblib", "submitit_local", "submitit_slurm", "ray"
 EXTRAS = {JOBLIB: "sweeps", LOCAL: "slurm", SLURM: "slurm", RAY: "ray"}
@@ -92,7 +93,13 @@ def plan(overrides: Sequence[str], directory: str | None = None) -> Plan:
     base = _compose(_first_values(given), directory)
     threads = _swept_threads(given) or base.threads
     records = Path(base.hydra.sweep.dir).resolve() / f".sweep-{uuid4().hex[:12]}"
-    environment = {sweep_cell.RECORDS: records, sweep_cell.CWD: Path.cwd(), sweep_cell.MAIN: os.getpid()}
+    environment: dict[str, object] = {
+        sweep_cell.RECORDS: records,
+        sweep_cell.CWD: Path.cwd(),
+        sweep_cell.MAIN: os.getpid(),
+    }
+    if base.device == "cuda" and chosen in (None, "basic", JOBLIB, LOCAL) and len(found := devices.gpus()) > 1:
+        environment[devices.GPUS] = ",".join(found)  # queues give a job its own
     own = _bounds(chosen or "basic", base, threads, given)
     own += [f"+hydra.job.env_set.{name}={_quoted(str(value))}" for name, value in environment.items()]
     return Plan(given + own, records, prod(map(len, _choices(base, overrides))))

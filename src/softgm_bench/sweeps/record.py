@@ -1,7 +1,7 @@
 """Records that the jobs of a sweep leave in their run folders, and what a folder says about its run.
 
-``running.json``: which process is at work. ``failure.json``: why the last attempt came to nothing. Both are gone when a
-run has finished.
+``running.json``: which process is at work, on which device. ``failure.json``: why the last attempt came to nothing.
+Both are gone when a run has finished.
 """
 
 import csv
@@ -35,14 +35,14 @@ class State:
 
 
 @contextmanager
-def running(run_dir: Path) -> Iterator[None]:
+def running(run_dir: Path, device: str) -> Iterator[None]:
     """Around a job: ``running.json`` says that this process is at work, and an earlier failure is forgotten.
 
     Raises:
         OSError: the folder cannot be written.
     """
     run_dir.mkdir(parents=True, exist_ok=True)
-    record = {"pid": os.getpid(), "host": socket.gethostname(), "started": time.time()}
+    record = {"pid": os.getpid(), "host": socket.gethostname(), "device": device, "started": time.time()}
     write_atomically(_running(run_dir), to_json(record).encode())
     _failure(run_dir).unlink(missing_ok=True)
     try:
@@ -130,7 +130,8 @@ def _locked(run_dir: Path) -> bool:
 
 def _process(run_dir: Path) -> str:
     record = _read(_running(run_dir))
-    return f"process {record['pid']} on {record.get('host')}" if "pid" in record else ""
+    at = [str(record[key]) for key in ("host", "device") if key in record]
+    return f"process {record['pid']} on {' '.join(at)}" if "pid" in record else ""
 
 
 def _progress(folder: RunFolder) -> str:
