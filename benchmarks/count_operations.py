@@ -25,7 +25,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from softgm_bench.assembly import build_algorithm, build_env
 from softgm_bench.config import Config, compose
-from softgm_bench.envs import SoftArmEnv, entries, simulation, soft_arm
+from softgm_bench.envs import SoftArmEnv, simulation, soft_arm
 from softgm_bench.models import gat
 from softgm_bench.rod import cuda_backend, sync
 from softgm_bench.rod.cuda_kernel import SIMULATED

@@ -166,7 +166,9 @@ def sense(agent_position: Tensor, bins: Bins, sensing_radius: float) -> Tensor:
     Returns:
         ``(num_envs, n_agents, n_bins)`` bool.
     """
-    distance = torch.cdist(agent_position, bins.descriptor[..., :3], compute_mode="donot_use_mm_for_euclid_dist")
+    x, y, z = (agent_position[..., i].unsqueeze(-1) - bins.descriptor[..., i].unsqueeze(1) for i in range(3))
+    # In the compiled loops' order. torch.cdist takes 22 ms on an H200 where these take under 1, and its order is not told.
+    distance = x.mul_(x).add_(z.mul_(z)).add_(y.mul_(y)).sqrt_()
     return (distance - bins.descriptor[..., 6].unsqueeze(1) < sensing_radius) & bins.mask.unsqueeze(1)
 
 

@@ -93,7 +93,7 @@ def _within_reach(point, start, axis, length, reach, bin_length):
 
 @numba.njit(cache=True, error_model="numpy")
 def _sensed(point, descriptor, sensing_radius):
-    """``sensing.sense`` for one pair; the order of the sum is that of ``torch.cdist`` on the CPU."""
+    """``sensing.sense`` for one pair, with the sum in its order."""
     x, y, z = point[0] - descriptor[0], point[1] - descriptor[1], point[2] - descriptor[2]
     return np.sqrt(x * x + z * z + y * y) - descriptor[6] < sensing_radius
 
