@@ -114,7 +114,7 @@ def look(
     sensing_radius: float,
     bin_length: float,
 ) -> Sight:
-    """Sense, discover, observe: a compiled loop on the CPU, ``look_dense`` elsewhere.
+    """Sense, discover, observe: a compiled loop on the CPU, a kernel on a GPU, ``look_dense`` elsewhere.
 
     Args:
         agent_position: m, ``(num_envs, n_agents, 3)``.
@@ -127,24 +127,53 @@ def look(
     Returns:
         What the agents see; equal, bit by bit, to ``look_dense``.
     """
-    if not sync.is_free(agent_position.device):
-        return look_dense(agent_position, bins, table, sensing_radius)
-    num_envs, n_agents = agent_position.shape[:2]
-    n_slots = table.bin_of_slot.shape[1]
-    descriptor = torch.zeros((num_envs, n_slots, 9))
-    active = torch.zeros((num_envs, n_slots), dtype=torch.bool)
-    edge = torch.zeros((num_envs, n_agents, n_slots), dtype=torch.bool)
+    device = agent_position.device
     if not bins.mask.shape[1]:
-        return Sight(table, torch.zeros_like(table.count), descriptor, active, edge)
+        return _nothing(agent_position, table)
+    if sync.is_free(device):
+        return _look_compiled(agent_position, cylinders, bins, table, sensing_radius, bin_length)
+    if sync.runs_kernels(device):
+        return _look_on_gpu(agent_position, bins, table, sensing_radius)
+    return look_dense(agent_position, bins, table, sensing_radius)
+
+
+def _nothing(agent_position: Tensor, table: SlotTable) -> Sight:
+    """What is seen where there are no bins."""
+    shape, device = table.bin_of_slot.shape, table.count.device
+    return Sight(
+        table=table,
+        new=torch.zeros_like(table.count),
+        descriptor=torch.zeros((*shape, 9), device=device),
+        active=torch.zeros(shape, dtype=torch.bool, device=device),
+        edge=torch.zeros((shape[0], agent_position.shape[1], shape[1]), dtype=torch.bool, device=device),
+    )
+
+
+def _look_compiled(
+    agent_position: Tensor,
+    cylinders: Cylinders,
+    bins: Bins,
+    table: SlotTable,
+    sensing_radius: float,
+    bin_length: float,
+) -> Sight:
+    seen = _nothing(agent_position, table)
     updated = [value.clone() for value in (table.bin_of_slot, table.known, table.count, table.dropped)]
-    new = torch.empty_like(table.count)
     scene = (cylinders.start, cylinders.axis, cylinders.length, cylinders.radius, cylinders.mask)
     read = sync.arrays(agent_position, *scene, bins.descriptor, bins.mask)
     real = read[0].dtype.type
-    written = sync.arrays(*updated, new, descriptor, active, edge)
+    written = sync.arrays(*updated, seen.new, seen.descriptor, seen.active, seen.edge)
     arguments = [*read, real(sensing_radius), real(bin_length), *written]
     sensing_kernel.look(*arguments)
-    return Sight(SlotTable(*updated, batch_size=table.batch_size), new, descriptor, active, edge)
+    return seen._replace(table=SlotTable(*updated, batch_size=table.batch_size))
+
+
+def _look_on_gpu(agent_position: Tensor, bins: Bins, table: SlotTable, sensing_radius: float) -> Sight:
+    from softgm_bench.envs import cuda_sensing  # only where Numba's CUDA target is
+
+    known = (table.bin_of_slot, table.known, table.count, table.dropped)
+    seen = cuda_sensing.look(agent_position, bins.descriptor, bins.mask, known, sensing_radius)
+    return Sight(SlotTable(*seen[:4], batch_size=table.batch_size), *seen[4:])
 
 
 def look_dense(agent_position: Tensor, bins: Bins, table: SlotTable, sensing_radius: float) -> Sight:
@@ -167,7 +196,7 @@ def sense(agent_position: Tensor, bins: Bins, sensing_radius: float) -> Tensor:
         ``(num_envs, n_agents, n_bins)`` bool.
     """
     x, y, z = (agent_position[..., i].unsqueeze(-1) - bins.descriptor[..., i].unsqueeze(1) for i in range(3))
-    # In the compiled loops' order. torch.cdist takes 22 ms on an H200 where these take under 1, and its order is not told.
+    # in the compiled loops' order; torch.cdist takes 22 ms on an H200 where these take under 1
     distance = x.mul_(x).add_(z.mul_(z)).add_(y.mul_(y)).sqrt_()
     return (distance - bins.descriptor[..., 6].unsqueeze(1) < sensing_radius) & bins.mask.unsqueeze(1)
 
