@@ -10,13 +10,9 @@ import numba
 import numpy as np
 
 from softgm_bench.rod.callees import with_callees
+from softgm_bench.rod.scalar_contact import product
 
 SLACK = 1e-4  # m, by which the bounds are widened; float32 rounds positions of a few metres to less than 1e-6
-
-
-def product(a, b):
-    """Return the product of two numbers; a CUDA kernel binds one that no compiler fuses with a sum."""
-    return a * b
 
 
 def senses(x, y, z, centre_x, centre_y, centre_z, radius, sensing_radius):

@@ -12,6 +12,7 @@ from numba.core.errors import NumbaPerformanceWarning
 from torch import Tensor
 
 from softgm_bench.rod.cuda_kernel import SIMULATED
+from softgm_bench.rod.scalar_contact import product
 
 if not SIMULATED:
     from numba.cuda import libdevice
@@ -54,8 +55,3 @@ def make_product(real: type) -> Callable[..., Any]:
         return rounded(a, b)
 
     return multiply
-
-
-def product(a, b):
-    """Return the product of two numbers."""
-    return a * b

@@ -18,8 +18,16 @@ def is_free(device: torch.device) -> bool:
     return device.type == "cpu"
 
 
-def runs_kernels(device: torch.device) -> bool:
-    """Tell whether CUDA kernels run on this device: on a GPU that Numba reaches, or a CPU under Numba's simulator."""
+MOST_THREADS = 1024  # of a kernel's block
+
+
+def runs_kernels(device: torch.device, threads: int = 1) -> bool:
+    """Tell whether CUDA kernels with so many threads a block run on this device.
+
+    They do on a GPU that Numba reaches, and on the CPU under Numba's simulator.
+    """
+    if threads > MOST_THREADS:
+        return False
     if numba.config.ENABLE_CUDASIM:
         return device.type == "cpu"
     return device.type == "cuda" and _numba_reaches_gpus()
