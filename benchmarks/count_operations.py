@@ -6,13 +6,14 @@ middle-sized batches. No GPU is needed: the CPU is sent down the way of devices 
 (``softgm_bench.rod.sync``), and Numba's simulator runs the CUDA kernels.
 
 Counted is what torch dispatches, as one each, and the launches of our own kernels. Views and allocations, which launch
-nothing, are counted apart. A few operations launch more than one kernel (``sort``, ``cumsum``), and on a GPU the
-clipping of gradients works on all parameters at once where it is counted here for each: this is no profile.
+nothing, are counted apart, and so are the arrays that our kernels are given: Numba wraps each at every launch. A few
+operations launch more than one kernel (``sort``, ``cumsum``), and on a GPU the clipping of gradients works on all
+parameters at once where it is counted here for each: this is no profile.
 """
 
 import argparse
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -20,20 +21,22 @@ from unittest import mock
 
 import torch
 from record import write
-from torch.utils._python_dispatch import TorchDispatchMode
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from softgm_bench.assembly import build_algorithm, build_env
 from softgm_bench.config import Config, compose
-from softgm_bench.envs import SoftArmEnv, simulation, soft_arm
+from softgm_bench.envs import SoftArmEnv, cuda_sensing, simulation, soft_arm
 from softgm_bench.models import gat
-from softgm_bench.rod import cuda_backend, sync
+from softgm_bench.rod import cuda_backend, cuda_checks, sync
 from softgm_bench.rod.cuda_kernel import SIMULATED
 
 TASKS = ("basic", "wall")
 SETTINGS = ("algo=softgm", "recipe=tuned", "backend=cuda", "dtype=float32", "rod.substeps=1", "threads=1")
 NUM_ENVS = 4
-ALLOCATIONS = ("empty", "empty_like", "empty_strided", "new_empty", "new_empty_strided")
+ALLOCATIONS = ("empty", "empty_like", "empty_strided", "new_empty", "new_empty_strided", "_unsafe_view")
+KERNELS = (cuda_backend, cuda_checks, cuda_sensing)  # modules that launch kernels of ours
 REST = "the rest"
 
 
@@ -44,6 +47,7 @@ class Operations(TorchDispatchMode):
         super().__init__()
         self.launched: Counter[str] = Counter()
         self.views: Counter[str] = Counter()
+        self.arrays: Counter[str] = Counter()
         self._parts = [REST]
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
@@ -69,14 +73,19 @@ class Operations(TorchDispatchMode):
     @contextmanager
     def kernels(self) -> Iterator[None]:
         """Count launches of our own kernels as one each, and nothing of what the simulator does in their place."""
-        function = cuda_backend._launch
 
-        def launch(*args: Any, **kwargs: Any) -> None:
-            self.launched[self._parts[-1]] += 1
-            with torch.utils._python_dispatch._disable_current_modes():
-                function(*args, **kwargs)
+        def counted(function: Callable[..., None]) -> Callable[..., None]:
+            def launch(kernel: Any, blocks: int, threads: int, tensors: Sequence[Tensor], *scalars: Any) -> None:
+                self.launched[self._parts[-1]] += 1
+                self.arrays[self._parts[-1]] += len(tensors)
+                with _disable_current_modes():
+                    function(kernel, blocks, threads, tensors, *scalars)
 
-        with mock.patch.object(cuda_backend, "_launch", launch):
+            return launch
+
+        with ExitStack() as stack:
+            for module in KERNELS:
+                stack.enter_context(mock.patch.object(module, "launch", counted(module.launch)))
             yield
 
 
@@ -103,8 +112,8 @@ def count(config: Config) -> list[dict[str, Any]]:
     with as_on_a_gpu(), torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
         td = algorithm.policy(env.reset())
         _, td = env.step_and_maybe_reset(td)  # constants are copied once
-        rows += _rows("policy call", *_counted(lambda: algorithm.policy(td)))
-        rows += _rows("environment step", *_counted(lambda: env.step_and_maybe_reset(td), _parts_of(env)))
+        rows += _rows("policy call", _counted(lambda: algorithm.policy(td)))
+        rows += _rows("environment step", _counted(lambda: env.step_and_maybe_reset(td), _parts_of(env)))
         frames = env.rollout(4, algorithm.policy)
     with as_on_a_gpu():
         minibatch = algorithm.prepare(frames)
@@ -112,7 +121,7 @@ def count(config: Config) -> list[dict[str, Any]]:
         parts = [(algorithm.loss, "forward", "loss"), (torch.Tensor, "backward", "backward")]
         parts += [(torch.nn.utils, "clip_grad_norm_", "clipping")]
         parts += [(optimizer, "step", "optimisers") for optimizer in _optimizers(algorithm)]
-        rows += _rows("gradient step", *_counted(lambda: algorithm._step(minibatch), parts))
+        rows += _rows("gradient step", _counted(lambda: algorithm._step(minibatch), parts))
     return rows
 
 
@@ -138,9 +147,7 @@ def _optimizers(algorithm: Any) -> list[torch.optim.Optimizer]:
     return [algorithm.actor_optimizer, algorithm.critic_optimizer]
 
 
-def _counted(
-    work: Callable[[], Any], parts: list[tuple[Any, str, str]] | None = None
-) -> tuple[Counter[str], Counter[str]]:
+def _counted(work: Callable[[], Any], parts: list[tuple[Any, str, str]] | None = None) -> Operations:
     operations = Operations()
     with ExitStack() as stack:
         for owner, name, part in parts or []:
@@ -148,13 +155,14 @@ def _counted(
         stack.enter_context(operations.kernels())
         stack.enter_context(operations)
         work()
-    return operations.launched, operations.views
+    return operations
 
 
-def _rows(what: str, launched: Counter[str], views: Counter[str]) -> list[dict[str, Any]]:
-    parts = sorted(launched | views, key=lambda part: -launched[part])
-    rows = [{"part": part, "operations": launched[part], "views": views[part]} for part in parts]
-    rows.insert(0, {"part": "all", "operations": launched.total(), "views": views.total()})
+def _rows(what: str, counted: Operations) -> list[dict[str, Any]]:
+    columns = {"operations": counted.launched, "views": counted.views, "kernel_arrays": counted.arrays}
+    parts = sorted(counted.launched | counted.views, key=lambda part: -counted.launched[part])
+    rows = [{"part": part} | {name: column[part] for name, column in columns.items()} for part in parts]
+    rows.insert(0, {"part": "all"} | {name: column.total() for name, column in columns.items()})
     return [{"what": what, **row} for row in rows]
 
 
@@ -166,10 +174,11 @@ def main() -> None:
         raise SystemExit("count_operations: set NUMBA_ENABLE_CUDASIM=1, so that CUDA kernels run without a GPU")
     torch.manual_seed(0)
     rows = []
-    print(f"{'task':<8}{'':<18}{'part':<14}{'operations':>11}{'views':>8}")
+    print(f"{'task':<8}{'':<18}{'part':<14}{'operations':>11}{'views':>8}{'arrays':>8}")
     for task in TASKS:
         for row in count(compose([f"task={task}", *SETTINGS])):
-            print(f"{task:<8}{row['what']:<18}{row['part']:<14}{row['operations']:>11}{row['views']:>8}")
+            counts = f"{row['operations']:>11}{row['views']:>8}{row['kernel_arrays']:>8}"
+            print(f"{task:<8}{row['what']:<18}{row['part']:<14}{counts}")
             rows.append({"task": task, **row})
     write(options.output, {"settings": list(SETTINGS), "rows": rows})
 

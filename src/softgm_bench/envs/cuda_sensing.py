@@ -54,7 +54,7 @@ def look(
     truths = torch.empty(num_envs * sum(flags), dtype=torch.bool, device=agents.device)
     shown = torch.empty((num_envs, n_slots, 9), dtype=torch.float32, device=agents.device)
     real = REAL[agents.dtype]
-    read = (agents.mT, descriptor, mask, *table)  # agents' places are taken from arrays of that layout
+    read = (agents, descriptor, mask, *table)
     launch(
         make_look(n_agents, n_bins, n_slots, real),
         num_envs,
@@ -74,7 +74,7 @@ def look(
 def make_look(n_agents: int, n_bins: int, n_slots: int, real: type) -> Callable[..., Any]:
     """Build the kernel for one size of scene and one precision; launch with a block of ``THREADS`` an environment.
 
-    Arguments: the agents ``(num_envs, 3, n_agents)``, then as ``look`` reads them; its three buffers; the radius.
+    Arguments: those of ``look``, its three buffers, the radius.
     """
     run = -(-n_bins // THREADS)  # bins of a thread
     senses = device(_senses, senses=device(sensing_kernel.senses, product=make_product(real)))
@@ -112,7 +112,7 @@ def make_look(n_agents: int, n_bins: int, n_slots: int, real: type) -> Callable[
 
 def _senses(agents, i, bin, sensing_radius):
     """Tell whether an agent senses a bin that exists."""
-    return senses(agents[0, i], agents[1, i], agents[2, i], bin[0], bin[1], bin[2], bin[6], sensing_radius)
+    return senses(agents[i, 0], agents[i, 1], agents[i, 2], bin[0], bin[1], bin[2], bin[6], sensing_radius)
 
 
 def _make_meet(n_agents: int) -> Callable[..., Any]:

@@ -4,6 +4,7 @@ Paper, section "Graph Construction". Everything is batched over environments; a 
 """
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
@@ -79,19 +80,23 @@ def cut_into_bins(cylinders: Cylinders, bin_length: float, max_length: float) ->
         ``n_cylinders * bins_per_cylinder(max_length, bin_length)`` bins, cylinder by cylinder.
     """
     length = cylinders.length.unsqueeze(-1)  # (num_envs, n_cylinders, 1)
-    near = bin_length * torch.arange(
-        bins_per_cylinder(max_length, bin_length), dtype=length.dtype, device=length.device
-    )
-    far = torch.minimum(near + bin_length, length)
+    near, end = _bounds(bins_per_cylinder(max_length, bin_length), bin_length, length.dtype, length.device)
+    far = torch.minimum(end, length)
     mask = cylinders.mask.unsqueeze(-1) & (near < length - 1e-9)
-    middle = 0.5 * (near + far)  # (num_envs, n_cylinders, n)
-    axis = cylinders.axis.unsqueeze(-2).expand(*middle.shape, 3)
-    centre = cylinders.start.unsqueeze(-2) + middle.unsqueeze(-1) * axis
-    scalars = torch.stack(
-        [cylinders.radius.unsqueeze(-1).expand_as(middle), length.expand_as(middle), middle / length], dim=-1
-    )
-    descriptor = torch.cat([centre, axis, scalars], dim=-1) * mask.unsqueeze(-1)
+    middle = (0.5 * (near + far)).unsqueeze(-1)  # (num_envs, n_cylinders, n, 1)
+    axis = cylinders.axis.unsqueeze(-2).expand(*mask.shape, 3)
+    centre = cylinders.start.unsqueeze(-2) + middle * axis
+    length = length.unsqueeze(-1).expand_as(middle)
+    radius = cylinders.radius.unsqueeze(-1).unsqueeze(-1).expand_as(middle)
+    descriptor = torch.cat([centre, axis, radius, length, middle / length], dim=-1) * mask.unsqueeze(-1)
     return Bins(descriptor=descriptor.flatten(1, 2), mask=mask.flatten(1, 2), batch_size=cylinders.batch_size)
+
+
+@lru_cache
+def _bounds(n: int, bin_length: float, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Where the bins of a long cylinder begin and end along its axis, m, ``(n,)`` each; not to be changed."""
+    near = bin_length * torch.arange(n, dtype=dtype, device=device)
+    return near, near + bin_length
 
 
 def empty_table(num_envs: int, n_slots: int, n_bins: int, device: torch.device) -> SlotTable:

@@ -11,6 +11,7 @@ from softgm_bench.rod import sync
 from softgm_bench.rod.callees import with_callees
 from softgm_bench.rod.contact import element_radius, safe_norm
 from softgm_bench.rod.scalar_contact import clip, product
+from softgm_bench.rod.scalar_nodes import radius_of, touches
 from softgm_bench.rod.state import Cylinders
 
 
@@ -69,19 +70,6 @@ def point_segment_distance(point: Tensor, start: Tensor, axis: Tensor, length: T
     offset = point - start
     along = torch.minimum((offset * axis).sum(-1).clamp(min=0.0), length)
     return safe_norm(offset - along[..., None] * axis, dim=-1)
-
-
-def radius_of(x, y, z, volume, tiny, pi):
-    """Radius of an element with this edge that keeps its volume, in the order of ``element_radius``'s arithmetic."""
-    return math.sqrt(volume / (math.sqrt(product(x, x) + product(y, y) + product(z, z)) + tiny) / pi)
-
-
-def touches(x, y, z, u, v, w, ax, ay, az, length, reach):
-    """Whether a point is within reach of the axis that starts at ``u, v, w``, as in ``point_segment_distance``."""
-    x, y, z = x - u, y - v, z - w
-    along = clip(product(x, ax) + product(y, ay) + product(z, az), length - length, length)
-    x, y, z = x - product(along, ax), y - product(along, ay), z - product(along, az)
-    return math.sqrt(product(x, x) + product(y, y) + product(z, z)) < reach
 
 
 _jit = numba.njit(cache=True, error_model="numpy")

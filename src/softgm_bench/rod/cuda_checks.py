@@ -16,7 +16,7 @@ import torch
 from numba import cuda
 from torch import Tensor
 
-from softgm_bench.rod import contact_nodes as scalar
+from softgm_bench.rod import scalar_nodes as scalar
 from softgm_bench.rod.callees import with_callees
 from softgm_bench.rod.cuda_kernel import device
 from softgm_bench.rod.cuda_launch import REAL, launch, make_product
