@@ -1,44 +1,27 @@
 """The CUDA kernel: its physics under Numba's simulator, its machine code without a GPU, and all of it on one."""
 
-import ast
-import os
-import subprocess
-import sys
 from pathlib import Path
-from xml.etree import ElementTree
 
 import pytest
 import torch
 
+import cuda_simulator
 from softgm_bench.rod.cuda_backend import CudaBackend
 from softgm_bench.rod.parameters import RodParameters
 from softgm_bench.rod.state import straight_rods
 
 SIMULATED = Path(__file__).with_name("cuda_simulated.py")
-NAMES = [node.name for node in ast.parse(SIMULATED.read_text()).body if isinstance(node, ast.FunctionDef)]
 
 
 @pytest.fixture(scope="module")
-def simulated(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str | None]]:
-    """Each simulated test's results, one for each of its cases: None where it passed."""
-    report = tmp_path_factory.mktemp("cuda") / "report.xml"
-    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", str(SIMULATED), f"--junitxml={report}"]
-    environment = os.environ | {"NUMBA_ENABLE_CUDASIM": "1", "OMP_NUM_THREADS": "1"}
-    run = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=900, check=False)
-    assert report.exists(), run.stdout + run.stderr
-    results: dict[str, list[str | None]] = {}
-    for case in ElementTree.parse(report).iter("testcase"):
-        trouble = [f"{case.get('name')}: {child.get('message')}\n{child.text}" for child in case]
-        results.setdefault(str(case.get("name")).split("[")[0], []).append("\n".join(trouble) or None)
-    return results
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> cuda_simulator.Results:
+    return cuda_simulator.run(SIMULATED, tmp_path_factory.mktemp("cuda"))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in NAMES if name.startswith("test_")])
-def test_simulated(simulated: dict[str, list[str | None]], name: str):
-    results = simulated[name]
-    failures = [trouble for trouble in results if trouble is not None]
-    assert not failures, "\n\n".join(failures)
+@pytest.mark.parametrize("name", cuda_simulator.names(SIMULATED))
+def test_simulated(simulated: cuda_simulator.Results, name: str):
+    assert not cuda_simulator.failures(simulated, name)
 
 
 def test_a_state_that_is_not_on_a_cuda_device_is_refused():

@@ -7,6 +7,8 @@ window over the episodes that end first would hold the quick ones, which are suc
 A round can end in any step, and nothing here looks at values: see ``softgm_bench.rod.sync``.
 """
 
+from functools import lru_cache
+
 import torch
 from tensordict import TensorClass
 from torch import Tensor
@@ -65,16 +67,21 @@ def note_ends(progress: Progress, ended: Tensor, success: Tensor, config: Curric
     counted = progress.counted + counts
     succeeded = progress.succeeded + (counts & success)
     total = quota * len(ended)
-    won = succeeded.sum().to(torch.float64)
-    open_still = (total - counted.sum()).to(torch.float64)
-    rises, falls = won / total > config.promote, (won + open_still) / total < config.demote
-    over = rises | falls | (open_still == 0)
-    change = rises.long() - falls.long()
+    won, seen = succeeded.sum(), counted.sum()
+    rises = won >= _fewest(total, config.promote, above=True)
+    falls = won - seen < _fewest(total, config.demote, above=False) - total  # were all that is open won
+    over = rises | falls | (seen == total)
     return Progress(
-        stage=(progress.stage + change).clamp(0, config.stages),
+        stage=(progress.stage + rises - falls.long()).clamp(0, config.stages),
         # what is under way when a round begins has lasted long already: more often a failure than not
-        counting=progress.counting & ~over,
-        counted=counted * ~over,
-        succeeded=succeeded * ~over,
+        counting=progress.counting > over,
+        counted=counted.masked_fill(over, 0),
+        succeeded=succeeded.masked_fill(over, 0),
         batch_size=progress.batch_size,
     )
+
+
+@lru_cache
+def _fewest(total: int, share: float, *, above: bool) -> int:
+    """Give the smallest number whose share of ``total`` is above ``share``, or at least ``share``."""
+    return next((n for n in range(total + 1) if n / total > share or (n / total == share and not above)), total + 1)

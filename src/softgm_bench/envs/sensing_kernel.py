@@ -9,7 +9,20 @@ import math
 import numba
 import numpy as np
 
+from softgm_bench.rod.callees import with_callees
+from softgm_bench.rod.scalar_contact import product
+
 SLACK = 1e-4  # m, by which the bounds are widened; float32 rounds positions of a few metres to less than 1e-6
+
+
+def senses(x, y, z, centre_x, centre_y, centre_z, radius, sensing_radius):
+    """``sensing.sense`` for one agent and one bin, with the sum in its order; the CUDA kernel calls it, too."""
+    x, y, z = x - centre_x, y - centre_y, z - centre_z
+    return math.sqrt(product(x, x) + product(z, z) + product(y, y)) - radius < sensing_radius
+
+
+_jit = numba.njit(cache=True, error_model="numpy")
+_senses = _jit(with_callees(senses, {"product": _jit(product)}))
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
@@ -93,9 +106,9 @@ def _within_reach(point, start, axis, length, reach, bin_length):
 
 @numba.njit(cache=True, error_model="numpy")
 def _sensed(point, descriptor, sensing_radius):
-    """``sensing.sense`` for one pair; the order of the sum is that of ``torch.cdist`` on the CPU."""
-    x, y, z = point[0] - descriptor[0], point[1] - descriptor[1], point[2] - descriptor[2]
-    return np.sqrt(x * x + z * z + y * y) - descriptor[6] < sensing_radius
+    return _senses(
+        point[0], point[1], point[2], descriptor[0], descriptor[1], descriptor[2], descriptor[6], sensing_radius
+    )
 
 
 @numba.njit(cache=True, error_model="numpy")

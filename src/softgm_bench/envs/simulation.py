@@ -90,6 +90,16 @@ class Outcome(NamedTuple):
     broken: Tensor
 
 
+class Beginning(NamedTuple):
+    """What all episodes have in common as they begin, of some number of environments; shapes as in ``Episodes``."""
+
+    rod: RodState
+    table: SlotTable
+    previous_action: Tensor
+    never: Tensor
+    whole: Tensor
+
+
 class Simulator:
     """Moves ``num_envs`` arms.
 
@@ -138,11 +148,12 @@ class Simulator:
         self.perturbation: Perturbation | None = None
         if perturbation is not None and not perturbation.nothing:
             self.perturbation = Perturbation(perturbation, config.n_agents, seed, device)
+        self._beginnings: dict[int, Beginning] = {}
         progress = first_progress(num_envs, device)
         nothing = torch.zeros((num_envs, 3), dtype=dtype, device=device)
         fresh, _ = self.fresh(num_envs, progress)
         self.state = Simulation(
-            episodes=fresh, progress=progress, push=nothing, tip_force=nothing.clone(), batch_size=[num_envs]
+            episodes=fresh.clone(), progress=progress, push=nothing, tip_force=nothing.clone(), batch_size=[num_envs]
         )
 
     # generators
@@ -174,7 +185,7 @@ class Simulator:
     def begin(self, stagger: bool) -> None:
         """Begin a new episode in every environment; ``stagger`` starts the clocks at random steps."""
         state = self.state
-        state.episodes, _ = self.fresh(len(state.push), state.progress)
+        state.episodes = self.fresh(len(state.push), state.progress)[0].clone()
         if stagger:
             state.episodes.steps.random_(0, self.horizon, generator=self._generator)
         state.progress.counting.fill_(not stagger)  # what is cut short says nothing about its scene
@@ -200,27 +211,45 @@ class Simulator:
         return rows, fresh, sight
 
     def fresh(self, count: int, progress: Progress) -> tuple[Episodes, Sight]:
-        """Make ``count`` episodes at their beginning, scenes drawn from the own generator, and what is sensed there."""
+        """Make ``count`` episodes at their beginning, scenes drawn from the own generator, and what is sensed there.
+
+        Not to be changed in place: what does not depend on the scene is shared with other beginnings.
+        """
         config = self.task.config
         level = difficulty(progress, config.curriculum) if self.curriculum else None
         scene = self.task.sample(count, self._generator, level).apply(self._real)
         bins = cut_into_bins(scene.cylinders, config.bin_length, self.task.max_cylinder_length)
-        never = torch.zeros(count, dtype=torch.bool, device=self.device)
+        blank = self._blank(count)
         episodes = Episodes(
-            rod=straight_rods(self.backend.parameters, count, self.dtype, self.device),
+            rod=blank.rod,
             scene=scene,
             bins=bins,
-            table=empty_table(count, self.n_slots, self._n_bins, self.device),
-            previous_action=torch.zeros((count, config.n_agents, DIRECTIONS), device=self.device),
-            steps=torch.zeros(count, dtype=torch.int64, device=self.device),
-            terminated=never,
-            truncated=never.clone(),
-            difficulty=torch.ones(count, device=self.device) * (1.0 if level is None else level),
+            table=blank.table,
+            previous_action=blank.previous_action,
+            steps=blank.table.count,
+            terminated=blank.never,
+            truncated=blank.never,
+            difficulty=blank.whole if level is None else level.to(torch.float32).expand(count),
             batch_size=[count],
         )
         sight = self.sense(episodes)
         episodes.table = sight.table
         return episodes, sight
+
+    def _blank(self, count: int) -> Beginning:
+        """Give what ``count`` beginnings have in common; where all rows are made at every step, made only once."""
+        if count in self._beginnings:
+            return self._beginnings[count]
+        blank = Beginning(
+            rod=straight_rods(self.backend.parameters, count, self.dtype, self.device),
+            table=empty_table(count, self.n_slots, self._n_bins, self.device),
+            previous_action=torch.zeros((count, self.task.config.n_agents, DIRECTIONS), device=self.device),
+            never=torch.zeros(count, dtype=torch.bool, device=self.device),
+            whole=torch.ones(count, device=self.device),
+        )
+        if not sync.is_free(self.device):
+            self._beginnings[count] = blank
+        return blank
 
     def _push_anew(self, mask: Tensor | None) -> None:
         if self.perturbation is not None:
@@ -289,7 +318,7 @@ class Simulator:
 
     def at_agents(self, of_nodes: Tensor) -> Tensor:
         """Select the agents' nodes: ``(num_envs, 3, n_nodes)`` to ``(num_envs, n_agents, 3)``."""
-        return of_nodes.index_select(-1, self._agent_node).transpose(-1, -2)
+        return of_nodes.mT.index_select(-2, self._agent_node)
 
     def contacts(self, episodes: Episodes) -> Tensor:
         """Tell which nodes touch a cylinder, ``(num_envs, n_nodes)`` bool."""

@@ -1,6 +1,6 @@
 """``SoftArmEnv``: N sections of one Cosserat-rod arm as cooperating agents, batched over environments."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -138,12 +138,11 @@ class SoftArmEnv(EnvBase):
         mask = done.reshape(-1)
         rows, fresh, sight = self.simulator.begin_again(mask)
 
-        def merged(old: Tensor, new: Tensor) -> Tensor:
-            if rows is None:
-                return torch.where(mask.view(-1, *(1,) * (old.ndim - 1)), new, old)
-            return old.index_copy(0, rows, new)
-
-        _put(self._first_frame(fresh, sight), tensordict, merged)
+        first = self._first_frame(fresh, sight)
+        if rows is None:
+            _put(tensordict, _merged(mask, dict(_leaves(first)), tensordict))
+        else:
+            _put(tensordict, {key: tensordict.get(key).index_copy(0, rows, new) for key, new in _leaves(first)})
         return tensordict
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
@@ -244,13 +243,25 @@ class SoftArmEnv(EnvBase):
         self.simulator.load_state(state)
 
 
-def _put(new: TensorDictBase, into: TensorDictBase, merged: Callable[[Tensor, Tensor], Tensor]) -> None:
-    """Replace every entry of ``into`` that is in ``new`` by ``merged(old, new)``."""
-    for name, value in new.items():
-        if isinstance(value, TensorDictBase):
-            _put(value, into.get(name), merged)
-        else:
-            into.set(name, merged(into.get(name), value))
+def _leaves(td: TensorDictBase) -> list[tuple[NestedKey, Tensor]]:
+    return list(td.items(include_nested=True, leaves_only=True))
+
+
+def _put(into: TensorDictBase, values: Mapping[NestedKey, Tensor]) -> None:
+    for key, value in values.items():
+        into.set(key, value)
+
+
+def _merged(mask: Tensor, new: Mapping[NestedKey, Tensor], old: TensorDictBase) -> dict[NestedKey, Tensor]:
+    """Take rows in ``mask`` from ``new`` and the others from ``old``: one choice a type, not one an entry."""
+    merged: dict[NestedKey, Tensor] = {}
+    for dtype in dict.fromkeys(value.dtype for value in new.values()):
+        names = [name for name, value in new.items() if value.dtype == dtype]
+        ours, theirs = (torch.cat([side[name].flatten(1) for name in names], dim=1) for side in (new, old))
+        widths = [new[name].shape[1:].numel() for name in names]
+        parts = torch.where(mask.unsqueeze(-1), ours, theirs).split(widths, dim=1)
+        merged |= {name: part.view(new[name].shape) for name, part in zip(names, parts, strict=True)}
+    return merged
 
 
 def _columns(*values: Tensor) -> tuple[Tensor, ...]:

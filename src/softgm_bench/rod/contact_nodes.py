@@ -1,4 +1,4 @@
-"""The geometric test of which nodes of a rod touch a cylinder: a compiled loop on the CPU, tensors elsewhere."""
+"""The geometric test of which nodes of a rod touch a cylinder: a compiled loop on the CPU, a kernel on a GPU."""
 
 import math
 
@@ -8,7 +8,10 @@ import torch
 from torch import Tensor
 
 from softgm_bench.rod import sync
+from softgm_bench.rod.callees import with_callees
 from softgm_bench.rod.contact import element_radius, safe_norm
+from softgm_bench.rod.scalar_contact import clip, product
+from softgm_bench.rod.scalar_nodes import radius_of, touches
 from softgm_bench.rod.state import Cylinders
 
 
@@ -26,7 +29,11 @@ def contact_nodes(position: Tensor, volume: Tensor, cylinders: Cylinders) -> Ten
         bool, ``(num_envs, n_nodes)``.
     """
     if not sync.is_free(position.device):
-        return contact_nodes_dense(position, volume, cylinders)
+        if not sync.runs_kernels(position.device, position.shape[-1]):
+            return contact_nodes_dense(position, volume, cylinders)
+        from softgm_bench.rod import cuda_checks  # only where Numba's CUDA target is
+
+        return cuda_checks.contact_nodes(position, volume, cylinders)
     touching = torch.zeros((position.shape[0], position.shape[2]), dtype=torch.bool)
     values = (position, volume, cylinders.start, cylinders.axis, cylinders.length, cylinders.radius, cylinders.mask)
     _mark(*sync.arrays(*values, touching))
@@ -63,6 +70,12 @@ def point_segment_distance(point: Tensor, start: Tensor, axis: Tensor, length: T
     offset = point - start
     along = torch.minimum((offset * axis).sum(-1).clamp(min=0.0), length)
     return safe_norm(offset - along[..., None] * axis, dim=-1)
+
+
+_jit = numba.njit(cache=True, error_model="numpy")
+_product = _jit(product)
+_radius_of = _jit(with_callees(radius_of, {"product": _product}))
+_touches = _jit(with_callees(touches, {"product": _product, "clip": _jit(clip)}))
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
@@ -109,7 +122,7 @@ def _node_radius(x, volume):
     radius, out = np.empty(n, x.dtype), np.empty(n + 1, x.dtype)
     for k in range(n):
         dx, dy, dz = x[0, k + 1] - x[0, k], x[1, k + 1] - x[1, k], x[2, k + 1] - x[2, k]
-        radius[k] = np.sqrt(volume[k] / (np.sqrt(dx * dx + dy * dy + dz * dz) + real(1e-14)) / real(math.pi))
+        radius[k] = _radius_of(dx, dy, dz, volume[k], real(1e-14), real(math.pi))
     for k in range(n + 1):
         out[k] = real(0.5) * (radius[max(k - 1, 0)] + radius[min(k, n - 1)])
     return out
@@ -118,9 +131,8 @@ def _node_radius(x, volume):
 @numba.njit(cache=True, error_model="numpy")
 def _compare(x, node_radius, start, axis, length, radius, touching):
     """Mark the nodes that touch one cylinder."""
-    zero = length - length
     for k in range(x.shape[1]):
-        dx, dy, dz = x[0, k] - start[0], x[1, k] - start[1], x[2, k] - start[2]
-        along = min(max(dx * axis[0] + dy * axis[1] + dz * axis[2], zero), length)
-        dx, dy, dz = dx - along * axis[0], dy - along * axis[1], dz - along * axis[2]
-        touching[k] |= np.sqrt(dx * dx + dy * dy + dz * dz) < node_radius[k] + radius
+        touching[k] |= _touches(
+            x[0, k], x[1, k], x[2, k], start[0], start[1], start[2], axis[0], axis[1], axis[2],
+            length, node_radius[k] + radius,
+        )  # fmt: skip

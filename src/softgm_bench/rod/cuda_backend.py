@@ -1,23 +1,13 @@
 """The GPU backend computes a control step of every environment in one kernel launch on torch's tensors and stream."""
 
-import warnings
-from typing import Any
-
-import numpy as np
 import torch
-from numba import cuda
-from numba.core.errors import NumbaPerformanceWarning
 from torch import Tensor
 
 from softgm_bench.rod.cuda_kernel import SIMULATED, Coefficients, coefficients
+from softgm_bench.rod.cuda_launch import REAL, launch
 from softgm_bench.rod.cuda_step import MAX_ELEMENTS, ROWS, make_step, scratch_columns
 from softgm_bench.rod.parameters import RodParameters
 from softgm_bench.rod.state import Cylinders, RodState, check_inputs
-
-# Numba warns of few rods; that many are all that the caller has.
-warnings.filterwarnings("ignore", message="Grid size", category=NumbaPerformanceWarning)
-
-_REAL = {torch.float64: np.float64, torch.float32: np.float32}
 
 
 class CudaBackend:
@@ -37,7 +27,7 @@ class CudaBackend:
                 f"rod.n_elements is {parameters.n_elements}: the cuda backend holds at most {MAX_ELEMENTS}"
             )
         self.parameters = parameters
-        self._coefficients: dict[type, Coefficients] = {real: coefficients(parameters, real) for real in _REAL.values()}
+        self._coefficients: dict[type, Coefficients] = {real: coefficients(parameters, real) for real in REAL.values()}
 
     def control_step(
         self,
@@ -67,7 +57,7 @@ class CudaBackend:
         check_inputs(self.parameters, state, couple, force, cylinders, active)
         device, dtype = state.position.device, state.position.dtype
         _check_device(device, couple=couple, force=force, active=active, cylinders=cylinders)
-        if dtype not in _REAL:
+        if dtype not in REAL:
             raise ValueError(f"the state is {dtype}: the cuda backend computes in float64 or float32")
         old = _inputs(dtype, state.position, state.director, state.velocity, state.omega)
         new = [torch.empty_like(field) for field in old]
@@ -82,14 +72,17 @@ class CudaBackend:
             if cylinders is not None and contact is not None:
                 geometry = (cylinders.start, cylinders.axis, cylinders.length, cylinders.radius)
                 obstacles = [*_inputs(dtype, *geometry), cylinders.mask.contiguous()]
-            columns = scratch_columns(self.parameters.n_elements, _REAL[dtype])
+            columns = scratch_columns(self.parameters.n_elements, REAL[dtype])
             scratch = torch.empty((len(couple), ROWS, columns), dtype=dtype, device=device) if columns else nothing
             flags = never[0] if active is None else active.bool().contiguous()
-            _launch(
-                make_step(self.parameters.n_elements, _REAL[dtype], contact),
+            launch(
+                make_step(self.parameters.n_elements, REAL[dtype], contact),
+                len(couple),
+                self.parameters.n_nodes,
                 [*old, *new, couple, force_or_nothing, flags, *obstacles, scratch],
-                (int(force is not None), int(active is not None)),
-                self._coefficients[_REAL[dtype]],
+                int(force is not None),
+                int(active is not None),
+                self._coefficients[REAL[dtype]],
                 self.parameters.substeps if substeps is None else substeps,
             )
         return RodState(*new, batch_size=state.batch_size)
@@ -98,19 +91,6 @@ class CudaBackend:
 def _inputs(dtype: torch.dtype, *tensors: Tensor) -> list[Tensor]:
     """Give what a kernel can read; no copies where dtype and layout are right already."""
     return [tensor.detach().to(dtype).contiguous() for tensor in tensors]
-
-
-def _launch(kernel: Any, tensors: list[Tensor], given: tuple[int, int], constants: Coefficients, substeps: int) -> None:
-    """Enqueue a control step on torch's current stream of the tensors' device."""
-    position = tensors[0]
-    num_envs, _, n_nodes = position.shape
-    if SIMULATED:
-        kernel[num_envs, n_nodes](*(tensor.numpy() for tensor in tensors), *given, constants, substeps)
-        return
-    with cuda.gpus[position.device.index]:
-        arrays = [cuda.as_cuda_array(tensor, sync=False) for tensor in tensors]
-        stream = cuda.external_stream(torch.cuda.current_stream(position.device).cuda_stream)
-        kernel[num_envs, n_nodes, stream](*arrays, *given, constants, substeps)
 
 
 def _check_device(device: torch.device, **arguments: Tensor | Cylinders | None) -> None:

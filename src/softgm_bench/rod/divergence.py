@@ -1,4 +1,4 @@
-"""Detection of broken rods: a compiled loop on the CPU, tensors elsewhere."""
+"""Detection of broken rods: a compiled loop on the CPU, a kernel on a GPU, tensors elsewhere."""
 
 import numba
 import torch
@@ -21,7 +21,11 @@ def diverged(state: RodState, rest_length: Tensor, low: float, high: float) -> T
         bool, ``(num_envs,)``.
     """
     if not sync.is_free(state.position.device):
-        return diverged_dense(state, rest_length, low, high)
+        if not sync.runs_kernels(state.position.device, state.position.shape[-1]):
+            return diverged_dense(state, rest_length, low, high)
+        from softgm_bench.rod import cuda_checks  # only where Numba's CUDA target is
+
+        return cuda_checks.diverged(state, rest_length, low, high)
     out = torch.empty(state.position.shape[0], dtype=torch.bool)
     values = (state.position, state.director, state.velocity, state.omega, rest_length)
     arguments = [*sync.arrays(*values, out), low, high]

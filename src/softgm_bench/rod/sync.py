@@ -5,6 +5,9 @@ stops both processors until all queued work is done; there the same results come
 values. Callers ask through this module (``sync.is_free``), so that a test can send the CPU down the other devices' way.
 """
 
+from functools import lru_cache
+
+import numba
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -13,6 +16,30 @@ from torch import Tensor
 def is_free(device: torch.device) -> bool:
     """Tell whether code for this device may read tensors' values without waiting."""
     return device.type == "cpu"
+
+
+MOST_THREADS = 1024  # of a kernel's block
+
+
+def runs_kernels(device: torch.device, threads: int = 1) -> bool:
+    """Tell whether CUDA kernels with so many threads a block run on this device.
+
+    They do on a GPU that Numba reaches, and on the CPU under Numba's simulator.
+    """
+    if threads > MOST_THREADS:
+        return False
+    if numba.config.ENABLE_CUDASIM:
+        return device.type == "cpu"
+    return device.type == "cuda" and _numba_reaches_gpus()
+
+
+@lru_cache
+def _numba_reaches_gpus() -> bool:
+    try:
+        from numba import cuda  # absent where Numba's CUDA target is not installed
+    except ImportError:
+        return False
+    return bool(cuda.is_available())
 
 
 def any_true(mask: Tensor) -> bool:

@@ -176,9 +176,18 @@ def uniform(count: int, bounds: Bounds, generator: torch.Generator) -> Tensor:
     return low + (high - low) * noise
 
 
-def uniform_box(count: int, bounds: tuple[Bounds, Bounds, Bounds], generator: torch.Generator) -> Tensor:
-    """Draw points from a box: ``(count, 3)`` float64."""
-    return torch.stack([uniform(count, axis, generator) for axis in bounds], dim=-1)
+def uniform_box(count: int, bounds: Sequence[Bounds] | Tensor, generator: torch.Generator) -> Tensor:
+    """Draw points from a box of any dimension d: ``(count, d)`` float64, one axis after the other.
+
+    ``bounds``: of each axis, or a tensor ``(d, 2)``.
+    """
+    if not isinstance(bounds, Tensor):
+        if any(isinstance(bound, Tensor) for axis in bounds for bound in axis):
+            return torch.stack([uniform(count, axis, generator) for axis in bounds], dim=-1)
+        bounds = constant(tuple(tuple(axis) for axis in bounds), generator.device)
+    low, high = bounds.unsqueeze(-1).unbind(1)
+    noise = torch.rand((len(bounds), count), generator=generator, device=generator.device, dtype=torch.float64)
+    return (low + (high - low) * noise).mT.contiguous()
 
 
 @lru_cache
@@ -219,12 +228,16 @@ def first_accepted(draw: Callable[[int], Tensor], accept: Callable[[Tensor], Ten
     """
     size = max(POOL, 16 * count)
     values = draw(size)
-    accepted = accept(values)
-    rank = torch.where(accepted, accepted.cumsum(0) - 1, size)
-    index = torch.arange(size, device=values.device)
-    # what is not accepted goes to one place too many
-    chosen = index.new_zeros(size + 1).scatter_(0, rank, index)
-    return values[chosen[index[:count] % accepted.sum().clamp(min=1)]]
+    rank = accept(values).cumsum(0)  # of an accepted one, from 1
+    wanted = _counted_up(count, values.device) % rank[-1:].clamp(min=1)
+    # behind the last place stands one that is not there if none is accepted
+    return values[torch.searchsorted(rank, wanted, right=True).clamp(max=size - 1)]
+
+
+@lru_cache
+def _counted_up(count: int, device: torch.device) -> Tensor:
+    """0, 1, .., count - 1; made once, not to be changed."""
+    return torch.arange(count, device=device)
 
 
 def no_cylinders(count: int, device: torch.device) -> Cylinders:

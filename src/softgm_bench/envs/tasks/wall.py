@@ -13,10 +13,8 @@ from softgm_bench.envs.tasks.base import (
     Task,
     TaskConfig,
     constant,
-    eased,
     redraw_until,
     uniform_box,
-    upright_cylinders,
 )
 from softgm_bench.envs.tasks.registry import register_task
 from softgm_bench.rod.state import Cylinders
@@ -98,16 +96,13 @@ class Wall(Task):
         c = self.config
         if difficulty is not None and not c.curriculum.enabled:
             raise ValueError("task.curriculum.enabled is false: scenes have no difficulty")
-        (side,) = eased([c.curriculum.easy_opening_side], [c.opening_side], difficulty)
-        target_x = eased(c.curriculum.easy_target_x, c.target_x, difficulty)
+        side, box = self._ranges(difficulty, generator.device)
 
         def draw(n: int) -> Tensor:
-            opening = uniform_box(n, ((c.wall_x, c.wall_x), c.opening_y, c.opening_z), generator)
-            target = uniform_box(n, (target_x, c.target_y, c.target_z), generator)
+            pair = uniform_box(n, box, generator).unflatten(-1, (2, 3))
             if difficulty is not None:
-                sideways = torch.lerp(opening[:, 1:], target[:, 1:], difficulty)
-                target = torch.cat([target[:, :1], sideways], dim=-1)
-            return torch.stack([opening, target], dim=1)
+                pair[:, 1, 1:] = torch.lerp(pair[:, 0, 1:], pair[:, 1, 1:], difficulty)
+            return pair
 
         def reachable(pair: Tensor) -> Tensor:
             opening, target = pair.unbind(dim=1)
@@ -118,26 +113,48 @@ class Wall(Task):
         return Scene(
             target=target,
             cylinders=self._columns(opening, side),
-            privileged=torch.cat([opening, torch.zeros_like(opening[:, :1]) + side], dim=-1),
+            privileged=torch.cat([opening, side.expand(count, 1)], dim=-1),
             batch_size=[count],
         )
 
-    def _columns(self, opening: Tensor, side: float | Tensor) -> Cylinders:
-        c = self.config
+    def _ranges(self, difficulty: Tensor | None, device: torch.device) -> tuple[Tensor, Tensor]:
+        """Give the opening's side and the ranges of its centre's and the target's coordinates, ``(6, 2)``."""
+        c, easy = self.config, self.config.curriculum
+        opening = ((c.wall_x, c.wall_x), tuple(c.opening_y), tuple(c.opening_z))
+        sideways = (tuple(c.target_y), tuple(c.target_z))
+        own = ((c.opening_side,) * 2, *opening, tuple(c.target_x), *sideways)
+        ranges = constant(own, device)
+        if difficulty is not None:
+            easiest = ((easy.easy_opening_side,) * 2, *opening, tuple(easy.easy_target_x), *sideways)
+            ranges = torch.lerp(constant(easiest, device), ranges, difficulty)  # exact at both ends
+        return ranges[0, 0], ranges[1:]
+
+    def _columns(self, opening: Tensor, side: Tensor) -> Cylinders:
+        """Whole columns and the lower parts of cut ones, then the upper parts of these; existing ones first."""
+        c, device, count = self.config, opening.device, len(opening)
         half = 0.5 * side
-        column_y = constant(self.column_y, opening.device)
-        cut = (column_y - opening[:, 1:2]).abs() <= half + 1e-12  # (count, n_columns)
-        low, high = constant(tuple(c.wall_z), opening.device).expand(len(opening), 2).unsqueeze(1).unbind(-1)
-        lower_top = torch.where(cut, opening[:, 2:3] - half, high)
-        # lower (or whole) parts first, upper parts behind them; then existing ones to the front
-        bottom = torch.cat([low.expand_as(cut), (opening[:, 2:3] + half).expand_as(cut)], dim=1)
-        top = torch.cat([lower_top, high.expand_as(cut)], dim=1)
-        mask = torch.cat([torch.ones_like(cut), cut], dim=1)
-        y = column_y.repeat(2).expand_as(bottom)
-        order = torch.argsort(mask.logical_not().to(torch.int8), dim=1, stable=True)[:, : self.max_cylinders]
-        bottom, top, y, mask = (x.gather(1, order) for x in (bottom, top, y, mask))
-        xy = torch.stack([torch.full_like(y, c.wall_x), y], dim=-1)
-        return upright_cylinders(xy, bottom, top, c.column_radius, mask)
+        (low, high), column_y = c.wall_z, constant(self.column_y, device)
+        n, more = len(self.column_y), self.max_cylinders - len(self.column_y)
+        y, z = opening[:, 1:2], opening[:, 2:3]
+        cut = (column_y - y).abs() <= half + 1e-12  # (count, n)
+        lower_top = torch.where(cut, z - half, constant((high,), device))
+        upper_bottom = z + half
+        exists, order = cut.to(torch.int8).sort(dim=1, stable=True, descending=True)
+        exists, order = exists[:, :more].bool(), order[:, :more]
+        lower = constant(tuple((c.wall_x, y, low) for y in self.column_y), device).expand(count, n, 3)
+        xy = constant(tuple((c.wall_x, y) for y in self.column_y), device)[order]
+        upper = torch.cat([xy, upper_bottom.unsqueeze(-1).expand(count, more, 1)], dim=-1)
+        # a masked cylinder keeps a positive length so that nothing divides by zero
+        upper_length = torch.where(exists, high - upper_bottom, constant((1.0,), device))
+        start = torch.cat([lower, upper], dim=1)
+        return Cylinders(
+            start=start,
+            axis=constant((0.0, 0.0, 1.0), device).expand_as(start),
+            length=torch.cat([lower_top - low, upper_length], dim=1),
+            radius=constant((c.column_radius,), device).expand(count, n + more),
+            mask=torch.nn.functional.pad(exists, (n, 0), value=True),
+            batch_size=[count],
+        )
 
 
 def _check_opening(config: WallConfig, name: str, side: float) -> None:
