@@ -1,10 +1,12 @@
 """Multi-head graph attention (paper, section "Attention-based Message Passing"; Velickovic et al. 2018).
 
-One set of parameters, three forms of the same layer:
+One set of parameters, five forms of the same layer:
 
 - ``forward``: dense and masked, for any adjacency; the plain reference;
 - ``entity_to_agent``: an edge list from obstacle nodes to agents, plus the agents' self-loops (stage 1);
-- ``chain``: neighbours on a chain plus self-loops (stage 2).
+- ``slots_to_agent``: the same from all slots, masked: shapes do not depend on the edges, and no value is looked at;
+- ``chain``: neighbours on a chain plus self-loops (stage 2);
+- ``chain_masked``: the same as dense attention, in fewer and larger operations.
 
 The GAT score ``a^T [u_i || u_j]`` is split into ``a_target^T u_i + a_source^T u_j``, so no pairwise feature tensor
 exists. Segment operations are ``index_add`` and ``scatter_reduce("amax")``: deterministic on CPU.
@@ -20,6 +22,7 @@ from torch.nn import functional
 from softgm_bench.models.chain_kernel import ChainAttention
 from softgm_bench.upstream import functorch
 
+Affine = tuple[Tensor, Tensor | None]  # weight and offset of a linear map
 NEGATIVE_SLOPE = 0.2  # of LeakyReLU, as in Velickovic et al. 2018; the paper gives none
 
 
@@ -137,6 +140,46 @@ class GraphAttention(nn.Module):
         aggregated = aggregated.index_add(0, target, incoming.unsqueeze(-1) * message)
         return self.output(aggregated), own, incoming
 
+    def slots_to_agent(
+        self, agents: Projection, slots: Tensor, affine: Affine, absent: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Stage 1 over all slots: each agent hears itself and the slots that it senses.
+
+        The slots' messages are never formed: what is linear can follow the weighted sum over slots as well, which has
+        N H rows an environment instead of M. (GATv2's scores need them.)
+
+        Args:
+            agents: projections of ``B N`` packed agents.
+            slots: nodes ``(B, M, in)``; finite where no agent senses them, too.
+            affine: ``joint_weight()``, or a product of it with an earlier linear map: ``(.., in)``, and an offset.
+            absent: what is added to scores, ``(B, N, 1, 1 + M)``: 0 for the agent itself and where it senses the slot,
+                else -inf.
+
+        Returns:
+            New agents ``(B N, out_features)``, weights of self-loops ``(B N, H)`` and of slots ``(B, N, H, M)``.
+        """
+        assert agents.target is not None
+        out, shape = self.heads * self.channels, absent.shape[:2]
+        weight, offset = affine
+        target, own = agents.target.unflatten(0, shape), agents.source.unflatten(0, shape)
+        if self.gatv2:
+            message = self.project(slots, weight, offset, receives=False).message
+            pairs = torch.cat([(target + own).unsqueeze(2), target.unsqueeze(2) + message.unsqueeze(1)], dim=2)
+            scores = self._score(pairs).transpose(-1, -2)
+        else:
+            part = None if offset is None else offset[out : out + self.heads]
+            source = functional.linear(slots, weight[out : out + self.heads], part).mT.unsqueeze(1)
+            scores = self._score(torch.cat([own.unsqueeze(-1), source.expand(*own.shape, -1)], -1) + target[..., None])
+        own_weight, weights = (scores + absent).softmax(-1).split([1, slots.shape[1]], -1)
+        mixed = torch.bmm(weights.flatten(1, 2), slots).view(-1, self.heads, slots.shape[-1])
+        heads = weight[:out].unflatten(0, (self.heads, self.channels))
+        incoming = torch.bmm(mixed.transpose(0, 1), heads.mT).transpose(0, 1)  # (B N, H, C)
+        own_weight = own_weight.flatten(0, 1)
+        if offset is not None:  # as often as the weights say, which with the own one sum to 1
+            incoming = incoming + (1.0 - own_weight) * offset[:out].unflatten(0, (self.heads, self.channels))
+        aggregated = torch.addcmul(incoming, own_weight, agents.message)
+        return self.output(aggregated), own_weight.squeeze(-1), weights
+
     def chain(self, agents: Projection, n_agents: int) -> tuple[Tensor, Tensor]:
         """Stage 2: each agent hears itself and its neighbours on the chain.
 
@@ -161,6 +204,28 @@ class GraphAttention(nn.Module):
         aggregated = own * message
         aggregated[:, 1:].add_(before[:, 1:] * message[:, :-1])  # addcmul_ has no batching rule under vmap
         aggregated[:, :-1].add_(after[:, :-1] * message[:, 1:])
+        return self.output(aggregated).flatten(0, 1), weights
+
+    def chain_masked(self, agents: Projection, absent: Tensor) -> tuple[Tensor, Tensor]:
+        """Stage 2 over all pairs of agents.
+
+        Args:
+            agents: projections of T packed agents, T a multiple of N.
+            absent: what is added to scores, ``(N, 1, N)``, target first: 0 between neighbours and on the diagonal, else
+                -inf.
+
+        Returns:
+            New agents ``(T, out_features)`` and the weights ``(T / N, N, H, N)``.
+        """
+        assert agents.target is not None
+        n_agents = len(absent)
+        message, source, target = (part.unflatten(0, (-1, n_agents)) for part in agents[:3] if part is not None)
+        if self.gatv2:
+            scores = self._score(target.unsqueeze(2) + source.unsqueeze(1)).transpose(-1, -2)
+        else:
+            scores = self._score(target.unsqueeze(-1) + source.mT.unsqueeze(1))
+        weights = (scores + absent).softmax(-1)
+        aggregated = torch.einsum("binj,bjnc->binc", weights, message)
         return self.output(aggregated).flatten(0, 1), weights
 
     def _compiles(self, values: Tensor) -> bool:

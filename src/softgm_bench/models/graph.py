@@ -4,6 +4,7 @@ Shapes: ``...`` are any leading batch dimensions (time, environment), N agents, 
 paper's: the N agents first, then the M slots. Contract with the environment: an edge exists only from an active slot.
 """
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -30,8 +31,11 @@ __all__ = [  # with the views, so that models name one module
     "OBSTACLE",
     "PAD",
     "Sensed",
+    "absent_neighbours",
+    "absent_slots",
     "agent_channels",
     "agent_features",
+    "all_slots",
     "chain_adjacency",
     "flat_features",
     "flat_observation",
@@ -86,6 +90,29 @@ def full_adjacency(td: TensorDictBase) -> Tensor:
 def pad_channels(channels: Tensor) -> Tensor:
     """Append the paper's reserved zeros: ``(..., 15)`` to ``(..., 22)``."""
     return torch.nn.functional.pad(channels, (0, NODE_FEATURES - CHANNELS))
+
+
+def absent_neighbours(n_agents: int, like: Tensor) -> Tensor:
+    """0 between an agent and itself or a neighbour on the chain, else -inf: ``(N, 1, N)``, target first."""
+    apart = like.new_full((n_agents, n_agents), -math.inf)
+    return (apart.triu(2) + apart.tril(-2)).unsqueeze(1)
+
+
+def absent_slots(td: TensorDictBase) -> Tensor:
+    """0 for an agent itself, which stands before the slots, and where it senses a slot, else -inf.
+
+    Leading dimensions are packed into B: ``(B, N, 1, 1 + M)``, of the type of the descriptors.
+    """
+    edge = td[entries.EDGE].flatten(0, -3) if td[entries.EDGE].ndim > 2 else td[entries.EDGE].unsqueeze(0)
+    heard = torch.nn.functional.pad(edge, (1, 0), value=True).unsqueeze(2)
+    return torch.zeros_like(heard, dtype=td[entries.SLOT_DESCRIPTOR].dtype).masked_fill_(~heard, -math.inf)
+
+
+def all_slots(td: TensorDictBase) -> Tensor:
+    """Features of all slots, ``(B, M, 15)``, leading dimensions packed into B; those of PAD are finite, no more."""
+    descriptor = td[entries.SLOT_DESCRIPTOR]
+    target, tip = td[entries.TARGET].unsqueeze(-2), td[entries.TIP].unsqueeze(-2)
+    return obstacle_channels(descriptor, target, tip).reshape(-1, descriptor.shape[-2], CHANNELS)
 
 
 class Sensed(NamedTuple):
