@@ -9,6 +9,7 @@ FREE = (
     "overwrite",
     "resume",
     "threads",
+    "compile",
     "logger",
     "experiment.checkpoint",
     "recipe",

@@ -8,6 +8,8 @@ from typing import Any
 NEUTRAL: dict[str, Any] = {
     "recipe": "",
     "resume": False,
+    "compile": None,
+    "matmul": None,
     "experiment.name": "",
     "task.train_horizon": None,
     "task.hidden_scene": False,
