@@ -61,7 +61,9 @@ def _validate_machine(config: Config) -> None:
         raise UserError(f"matmul={config.matmul}: choose one of {', '.join(MATMULS)}, or null")
     kind = device_type(config.device)
     if config.compile == GRAPHS and kind == "cpu":
-        raise UserError(f"compile={GRAPHS} with device={config.device}: CUDA graphs need device=cuda; choose none or null")
+        raise UserError(
+            f"compile={GRAPHS} with device={config.device}: CUDA graphs need device=cuda; choose none or null"
+        )
     if config.backend is not None:
         try:
             check_backend(config.backend, kind)

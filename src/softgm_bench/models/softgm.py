@@ -2,9 +2,9 @@
 
 Cheap by construction. Only obstacle slots with an edge to some agent are computed: slots hear nobody, so one without an
 edge cannot influence any agent. On a device that must not be waited for (``softgm_bench.rod.sync``) all slots are
-computed and masked instead, in shapes that no value decides on. Nothing between ``W_in`` and the first attention layer is nonlinear, so their matrices
-are multiplied first and ``h^(0)`` is never formed (unless a residual connection needs it). ``forward_dense`` is the
-paper's text, all nodes and masked, with the same parameters; the two agree to rounding.
+computed and masked instead, in shapes that no value decides on. Nothing between ``W_in`` and the first attention layer
+is nonlinear, so their matrices are multiplied first and ``h^(0)`` is never formed (unless a residual connection needs
+it). ``forward_dense`` is the paper's text, all nodes and masked, with the same parameters; the forms agree to rounding.
 
 Where the paper is silent: ELU after every layer but the very last, a bias in every layer, and heads concatenated in all
 of them (Velickovic et al. 2018 average them in a classifier's last layer).

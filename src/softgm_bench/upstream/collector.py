@@ -56,10 +56,12 @@ class RecordingCollector(FrameCollector):
     its parameters and its input, and explores by the device's default generator.
     """
 
+    _carrier: TensorDictBase  # what the policy is shown next
+
     def __init__(self, env: Any, policy: TensorDictModuleBase, frames_per_batch: int) -> None:
         """Arguments as of ``FrameCollector``."""
         super().__init__(env, policy, frames_per_batch)
-        self._batch: TensorDictBase | None = None  # (num_envs, steps)
+        self._batch: Any = None  # (num_envs, steps)
         self._time = torch.zeros(1, dtype=torch.int64, device=env.device)  # of the frame to be collected
         self._advance = Recorded(self._step, self._changed, env.device, "collection", env.generators())
 

@@ -20,8 +20,6 @@ from torch import Tensor
 
 WARM_UPS = 3  # compile kernels, choose algorithms and take workspaces, which must not happen while recording
 
-Function = Callable[..., Tensor | None]
-
 
 class CudaGraph:
     """One recording on one device, by ``torch.cuda.CUDAGraph``."""
@@ -84,7 +82,7 @@ class Recorded:
 
     def __init__(
         self,
-        function: Function,
+        function: Callable[..., Any],
         changed: Callable[[], Sequence[Tensor]],
         device: torch.device,
         what: str,
@@ -110,7 +108,7 @@ class Recorded:
         self._inputs: TensorDictBase | None = None
         self._output: Tensor | None = None
 
-    def __call__(self, inputs: TensorDictBase | None = None) -> Tensor | None:
+    def __call__(self, inputs: TensorDictBase | None = None) -> Any:
         """What the function gives, in a tensor of its own."""
         if self._graph is None and not self.failed:
             self._record(inputs)
@@ -121,7 +119,7 @@ class Recorded:
         self._graph.replay()
         return None if self._output is None else self._output.clone()
 
-    def _call(self, inputs: TensorDictBase | None) -> Tensor | None:
+    def _call(self, inputs: TensorDictBase | None) -> Any:
         return self._function() if inputs is None else self._function(inputs)
 
     def _record(self, inputs: TensorDictBase | None) -> None:
@@ -158,7 +156,8 @@ def copy_into(targets: Sequence[Tensor], sources: Sequence[Tensor]) -> None:
     """Copy every source into its target, in a few launches."""
     pairs = [(target, source) for target, source in zip(targets, sources, strict=True) if target is not source]
     for _, group in itertools.groupby(sorted(pairs, key=_kind), key=_kind):
-        torch._foreach_copy_(*(list(tensors) for tensors in zip(*group, strict=True)))
+        into, what = zip(*group, strict=True)
+        torch._foreach_copy_(into, what)
 
 
 def prepare_optimizer(optimizer: torch.optim.Optimizer) -> None:
