@@ -12,7 +12,6 @@ from recordings import Broken, Repetition, recordings
 from round_trips import RoundTrips
 from softgm_bench.algorithms import build_algorithm
 from softgm_bench.envs import make_env
-from softgm_bench.upstream import graphs
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -124,7 +123,7 @@ def test_nothing_in_a_step_waits_for_a_device(build, name):
     with recordings(), force_dense():
         one, env = build(name, recorded=True)
         found = []
-        step = one._take_step._function
+        step = one._recorded._function
 
         def watched(inputs):
             with RoundTrips() as trips:
@@ -132,7 +131,7 @@ def test_nothing_in_a_step_waits_for_a_device(build, name):
             found.append(trips.found)
             return metrics
 
-        one._take_step._function = watched
+        one._recorded._function = watched
         for batch in batches(one, env, 2):
             one.update(batch)
     assert found
@@ -141,5 +140,5 @@ def test_nothing_in_a_step_waits_for_a_device(build, name):
 
 def test_plain_steps_stay_plain(build):
     one, _ = build("softgm", recorded=False)
-    assert not isinstance(one._take_step, graphs.Recorded)
+    assert one._recorded is None
     assert isinstance(one.actor_optimizer.param_groups[0]["lr"], float)

@@ -110,7 +110,7 @@ def test_recorded_training_is_plain_training(build, name):
             rows.append(algorithm.update(batch))
         collector.shutdown()
         if recorded:
-            assert not algorithm._take_step.failed
+            assert not algorithm._recorded.failed
             assert name == "masac" or not collector._advance.failed
     for plain, other in zip(frames[:2], frames[4:6], strict=True):
         for key in plain.keys(True, True):

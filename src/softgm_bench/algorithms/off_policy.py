@@ -1,6 +1,5 @@
 """Shared by DDPG and SAC: replay buffer, exploration, and how many gradient steps follow a batch of frames."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
@@ -162,14 +161,14 @@ class OffPolicy:
         self.replay = _make_replay(config.replay_capacity, env, n_privileged)
         self.frames = 0
         self._due = 0.0  # gradient steps, of which whole ones are taken
-        self._take_step: Callable[[TensorDictBase], Tensor] = self._step
+        self._recorded: graphs.Recorded | None = None
 
     def use_graphs(self) -> None:
         """Take gradient steps as replays of a CUDA graph from now on."""
         for optimizer in self.optimizers.values():
             graphs.prepare_optimizer(optimizer)
         device = next(self.loss.parameters()).device
-        self._take_step = graphs.Recorded(self._step, self._changed, device, "the gradient step")
+        self._recorded = graphs.Recorded(self._step, self._changed, device, "the gradient step")
 
     def _changed(self) -> list[Tensor]:
         """Tensors that a gradient step changes: networks, target networks, optimisers."""
@@ -191,9 +190,9 @@ class OffPolicy:
         self.frames += batch.numel()
         steps = self._steps_for(batch.numel())
         self.policy.schedule(self.frames)
-        totals = None
+        totals, step = None, self._recorded or self._step
         for _ in range(steps):
-            metrics = self._take_step(self.sample())
+            metrics = step(self.sample())
             totals = metrics if totals is None else totals + metrics
         # the only look at results: a GPU works through all steps without being waited for
         values = [float("nan")] * len(self._names) if totals is None else (totals / steps).tolist()
@@ -235,7 +234,7 @@ class OffPolicy:
         for name, optimizer in self.optimizers.items():
             optimizer.load_state_dict(state["optimizers"][name])
         self.frames, self._due = state["frames"], state["due"]
-        if isinstance(self._take_step, graphs.Recorded):  # the optimisers' tensors are others now
+        if self._recorded is not None:  # the optimisers' tensors are others now
             self.use_graphs()
         if "replay" in state:
             self.replay.load_state_dict(state["replay"])

@@ -4,7 +4,6 @@ SoftGM and MAPPO have a centralised critic, one value of the state; IPPO an inde
 that agent observes. Actors and, in IPPO, critics share their parameters among agents.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +12,6 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 from torchrl.modules.value_norm import PopArtValueNorm
-from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from softgm_bench.algorithms.registry import register_algorithm
@@ -22,6 +20,7 @@ from softgm_bench.envs import entries
 from softgm_bench.envs.interface import Environment, Sizes
 from softgm_bench.models.heads import STATE_VALUE, ActorConfig, ValueConfig, build_actor, build_value
 from softgm_bench.upstream import graphs
+from softgm_bench.upstream.ppo_loss import LeanPPOLoss
 
 ADVANTAGE, VALUE_TARGET = "advantage", "value_target"
 REPORTED = ("loss_objective", "loss_critic", "kl_approx", "clip_fraction")
@@ -113,7 +112,7 @@ class PPO:
         known = sizes.n_privileged if oracle or config.critic.asymmetric else 0
         self.policy = self.build_policy(config, model_config, sizes, oracle).to(env.device)
         self.critic = build_value(model_config, sizes, config.critic, config.centralised, known).to(env.device)
-        self.loss = ClipPPOLoss(
+        self.loss = LeanPPOLoss(
             self.policy,
             self.critic,
             clip_epsilon=config.clip_epsilon,
@@ -139,14 +138,14 @@ class PPO:
         self.critic_optimizer = torch.optim.Adam(self._critic_parameters, lr=config.critic_lr, eps=1e-5, fused=True)
         self.trained_frames = 0
         self._kl_scale = 1.0  # of the actor's learning rate
-        self._take_step: Callable[[TensorDictBase], Tensor] = self._step
+        self._recorded: graphs.Recorded | None = None
 
     def use_graphs(self) -> None:
         """Take gradient steps as replays of a CUDA graph from now on, those on minibatches of the usual size."""
         for optimizer in self._optimizers:
             graphs.prepare_optimizer(optimizer)
         device = self._actor_parameters[0].device
-        self._take_step = graphs.Recorded(self._step, self._changed, device, "PPO's gradient step")
+        self._recorded = graphs.Recorded(self._step, self._changed, device, "PPO's gradient step")
 
     @property
     def _optimizers(self) -> tuple[torch.optim.Optimizer, torch.optim.Optimizer]:
@@ -233,7 +232,8 @@ class PPO:
         shuffled = frames[torch.randperm(len(frames), device=frames.device)]
         # a rest much smaller than a minibatch would weigh its few frames too much
         minibatches = [chosen for chosen in shuffled.split(size) if 2 * len(chosen) >= min(size, len(frames))]
-        return torch.stack([self._take_step(minibatch) for minibatch in minibatches]).mean(0)
+        step = self._recorded or self._step
+        return torch.stack([step(minibatch) for minibatch in minibatches]).mean(0)
 
     def _adapt(self, kl: float) -> None:
         """Scale the actor's learning rate so that the policy's change per update stays near ``target_kl``.
@@ -294,7 +294,7 @@ class PPO:
         if self.value_norm is not None:
             self.value_norm.load_state_dict(state["value_norm"])
         self.trained_frames, self._kl_scale = state["trained_frames"], state["kl_scale"]
-        if isinstance(self._take_step, graphs.Recorded):  # the optimisers' tensors are others now
+        if self._recorded is not None:  # the optimisers' tensors are others now
             self.use_graphs()
 
 

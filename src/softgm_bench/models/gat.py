@@ -109,12 +109,13 @@ class GraphAttention(nn.Module):
             kept = out if self.gatv2 else out + self.heads
             weight, offset = weight[:kept], None if offset is None else offset[:kept]
         values = functional.linear(nodes, weight, offset)
-        message = values[..., :out].unflatten(-1, (self.heads, self.channels))
+        widths = [out] * (1 + receives) if self.gatv2 else [out, *[self.heads] * (1 + receives)]
+        first, *others = values.split(widths, dim=-1)
+        message = first.unflatten(-1, (self.heads, self.channels))
         if self.gatv2:
-            target = values[..., out:].unflatten(-1, (self.heads, self.channels)) if receives else None
+            target = others[0].unflatten(-1, (self.heads, self.channels)) if receives else None
             return Projection(message, message, target, values)
-        source = values[..., out : out + self.heads]
-        return Projection(message, source, values[..., out + self.heads :] if receives else None, values)
+        return Projection(message, others[0], others[1] if receives else None, values)
 
     def entity_to_agent(
         self, agents: Projection, entities: Projection, source: Tensor, target: Tensor
@@ -140,6 +141,18 @@ class GraphAttention(nn.Module):
         aggregated = aggregated.index_add(0, target, incoming.unsqueeze(-1) * message)
         return self.output(aggregated), own, incoming
 
+    def project_agents(self, agents: Tensor, pending: Affine | None) -> Projection:
+        """What ``project`` gives of nodes that receive, ``(T, in)``, after a linear map that is still to be applied.
+
+        Scores are taken from the messages: on a GPU that is less than to make one matrix of weights at every step.
+        """
+        if self.gatv2:
+            return self.project(agents, *after(self.joint_weight(), pending), receives=True)
+        message = functional.linear(agents, *after(self.weight, pending)).unflatten(-1, (self.heads, self.channels))
+        vectors = torch.stack([self.source, self.target], dim=-1)
+        source, target = torch.bmm(message.transpose(0, 1), vectors).permute(2, 1, 0)
+        return Projection(message, source, target, message)
+
     def slots_to_agent(
         self, agents: Projection, slots: Tensor, affine: Affine, absent: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
@@ -151,32 +164,33 @@ class GraphAttention(nn.Module):
         Args:
             agents: projections of ``B N`` packed agents.
             slots: nodes ``(B, M, in)``; finite where no agent senses them, too.
-            affine: ``joint_weight()``, or a product of it with an earlier linear map: ``(.., in)``, and an offset.
-            absent: what is added to scores, ``(B, N, 1, 1 + M)``: 0 for the agent itself and where it senses the slot,
-                else -inf.
+            affine: ``weight``, or a product of it with an earlier linear map: ``(out, in)``, and an offset.
+            absent: what is added to scores, ``(B, N, 1, M)``: 0 where the agent senses the slot, else -inf.
 
         Returns:
             New agents ``(B N, out_features)``, weights of self-loops ``(B N, H)`` and of slots ``(B, N, H, M)``.
         """
         assert agents.target is not None
-        out, shape = self.heads * self.channels, absent.shape[:2]
+        shape = absent.shape[:2]
         weight, offset = affine
+        heads = weight.unflatten(0, (self.heads, self.channels))
+        offsets = None if offset is None else offset.unflatten(0, (self.heads, self.channels))
         target, own = agents.target.unflatten(0, shape), agents.source.unflatten(0, shape)
         if self.gatv2:
-            message = self.project(slots, weight, offset, receives=False).message
+            message = functional.linear(slots, weight, offset).unflatten(-1, (self.heads, self.channels))
             pairs = torch.cat([(target + own).unsqueeze(2), target.unsqueeze(2) + message.unsqueeze(1)], dim=2)
-            scores = self._score(pairs).transpose(-1, -2)
+            scores = self._score(pairs).transpose(-1, -2) + functional.pad(absent, (1, 0))
         else:
-            part = None if offset is None else offset[out : out + self.heads]
-            source = functional.linear(slots, weight[out : out + self.heads], part).mT.unsqueeze(1)
-            scores = self._score(torch.cat([own.unsqueeze(-1), source.expand(*own.shape, -1)], -1) + target[..., None])
-        own_weight, weights = (scores + absent).softmax(-1).split([1, slots.shape[1]], -1)
+            rows = torch.bmm(self.source.unsqueeze(1), heads).squeeze(1)
+            part = None if offsets is None else (self.source * offsets).sum(-1)
+            source = functional.linear(slots, rows, part).mT.unsqueeze(1) + absent
+            scores = self._score(torch.cat([own.unsqueeze(-1), source], -1) + target.unsqueeze(-1))
+        own_weight, weights = scores.softmax(-1).split([1, slots.shape[1]], -1)
         mixed = torch.bmm(weights.flatten(1, 2), slots).view(-1, self.heads, slots.shape[-1])
-        heads = weight[:out].unflatten(0, (self.heads, self.channels))
         incoming = torch.bmm(mixed.transpose(0, 1), heads.mT).transpose(0, 1)  # (B N, H, C)
         own_weight = own_weight.flatten(0, 1)
-        if offset is not None:  # as often as the weights say, which with the own one sum to 1
-            incoming = incoming + (1.0 - own_weight) * offset[:out].unflatten(0, (self.heads, self.channels))
+        if offsets is not None:  # as often as the weights say, which with the own one sum to 1
+            incoming = torch.addcmul(incoming, 1.0 - own_weight, offsets)
         aggregated = torch.addcmul(incoming, own_weight, agents.message)
         return self.output(aggregated), own_weight.squeeze(-1), weights
 
@@ -241,6 +255,13 @@ class GraphAttention(nn.Module):
         """Scores from the sum of the target's and the source's part: ``(..., H)``."""
         pair = functional.leaky_relu(pair, NEGATIVE_SLOPE)
         return (pair * self.source).sum(-1) if self.gatv2 else pair
+
+
+def after(weight: Tensor, pending: Affine | None) -> Affine:
+    """``weight`` applied after a pending linear map, as one linear map."""
+    if pending is None:
+        return weight, None
+    return weight @ pending[0], None if pending[1] is None else weight @ pending[1]
 
 
 def edge_softmax(own: Tensor, incoming: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:

@@ -5,6 +5,7 @@ paper's: the N agents first, then the M slots. Contract with the environment: an
 """
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
@@ -92,20 +93,20 @@ def pad_channels(channels: Tensor) -> Tensor:
     return torch.nn.functional.pad(channels, (0, NODE_FEATURES - CHANNELS))
 
 
-def absent_neighbours(n_agents: int, like: Tensor) -> Tensor:
-    """0 between an agent and itself or a neighbour on the chain, else -inf: ``(N, 1, N)``, target first."""
-    apart = like.new_full((n_agents, n_agents), -math.inf)
+@lru_cache
+def absent_neighbours(n_agents: int, device: torch.device, dtype: torch.dtype) -> Tensor:
+    """0 between an agent and itself or a neighbour on the chain, else -inf: ``(N, 1, N)``, target first.
+
+    Made once, and not to be changed.
+    """
+    apart = torch.full((n_agents, n_agents), -math.inf, device=device, dtype=dtype)
     return (apart.triu(2) + apart.tril(-2)).unsqueeze(1)
 
 
 def absent_slots(td: TensorDictBase) -> Tensor:
-    """0 for an agent itself, which stands before the slots, and where it senses a slot, else -inf.
-
-    Leading dimensions are packed into B: ``(B, N, 1, 1 + M)``, of the type of the descriptors.
-    """
-    edge = td[entries.EDGE].flatten(0, -3) if td[entries.EDGE].ndim > 2 else td[entries.EDGE].unsqueeze(0)
-    heard = torch.nn.functional.pad(edge, (1, 0), value=True).unsqueeze(2)
-    return torch.zeros_like(heard, dtype=td[entries.SLOT_DESCRIPTOR].dtype).masked_fill_(~heard, -math.inf)
+    """0 where an agent senses a slot, else -inf: ``(B, N, 1, M)``, leading dimensions packed into B."""
+    edge = td[entries.EDGE]
+    return edge.to(td[entries.SLOT_DESCRIPTOR].dtype).log().reshape(-1, edge.shape[-2], 1, edge.shape[-1])
 
 
 def all_slots(td: TensorDictBase) -> Tensor:

@@ -23,7 +23,7 @@ from softgm_bench.envs import entries
 from softgm_bench.envs.interface import Sizes
 from softgm_bench.models import graph
 from softgm_bench.models.attention import chain_attention, entity_attention, slot_attention, stack_layers
-from softgm_bench.models.gat import Affine, GraphAttention
+from softgm_bench.models.gat import Affine, GraphAttention, after
 from softgm_bench.models.registry import Encoder, register_model
 from softgm_bench.rod import sync
 
@@ -145,12 +145,12 @@ class SoftGMEncoder(Encoder):
         for depth, layer in enumerate(_layers(self.stage1), start=1):
             last = depth == len(self.stage1)
             weight = layer.joint_weight()
-            own = layer.project(agents, *_after(weight, pending), receives=True)
+            own = layer.project(agents, *after(weight, pending), receives=True)
             own_weights, edge_weights = None, None
             if sensed is None:  # every agent hears only itself
                 out = layer.output(own.message)
             else:
-                other = layer.project(entities, *_after(weight, entity_pending), receives=False)
+                other = layer.project(entities, *after(weight, entity_pending), receives=False)
                 out, own_weights, edge_weights = layer.entity_to_agent(own, other, sensed.source, sensed.target)
                 if not last:  # an obstacle node hears only itself; nobody reads what the last layer makes of it
                     entities, entity_pending = self._between(layer.output(other.message), entities, last=False), None
@@ -166,13 +166,12 @@ class SoftGMEncoder(Encoder):
         slots, slot_pending = self._enter(graph.all_slots(td), graph.OBSTACLE)  # (B, M, 15 or hidden)
         for depth, layer in enumerate(_layers(self.stage1), start=1):
             last = depth == len(self.stage1)
-            weight = layer.joint_weight()
-            own = layer.project(agents, *_after(weight, pending), receives=True)
-            affine = _after(weight, slot_pending)
+            affine = after(layer.weight, slot_pending)
+            own = layer.project_agents(agents, pending)
             out, own_weights, slot_weights = layer.slots_to_agent(own, slots, affine, absent)
-            if not last:
-                message = layer.project(slots, *affine, receives=False).message
-                slots, slot_pending = self._between(layer.output(message), slots, last=False), None
+            if not last:  # a slot hears only itself, as obstacles do
+                message = functional.linear(slots, *affine) + layer.bias
+                slots, slot_pending = self._between(message, slots, last=False), None
             agents, pending = self._between(out, agents, last=last and not len(self.stage2)), None
             if record is not None:
                 record.append(slot_attention(own_weights, slot_weights))
@@ -180,13 +179,13 @@ class SoftGMEncoder(Encoder):
 
     def _agent_stage(self, agents: Tensor, pending: Affine | None, n_agents: int, record: Record) -> Tensor:
         """Stage 2: ``(B N, hidden)`` after L layers of agent <-> agent messages."""
-        absent = None if sync.is_free(agents.device) else graph.absent_neighbours(n_agents, agents)
+        absent = None if sync.is_free(agents.device) else graph.absent_neighbours(n_agents, agents.device, agents.dtype)
         for depth, layer in enumerate(_layers(self.stage2), start=1):
-            own = layer.project(agents, *_after(layer.joint_weight(), pending), receives=True)
             if absent is None:
+                own = layer.project(agents, *after(layer.joint_weight(), pending), receives=True)
                 out, weights = layer.chain(own, n_agents)
             else:
-                out, weights = layer.chain_masked(own, absent)
+                out, weights = layer.chain_masked(layer.project_agents(agents, pending), absent)
             agents, pending = self._between(out, agents, last=depth == len(self.stage2)), None
             if record is not None:
                 record.append(chain_attention(weights) if absent is None else weights.transpose(1, 2))
@@ -209,10 +208,3 @@ class SoftGMEncoder(Encoder):
 
 def _layers(stage: nn.ModuleList) -> Iterable[GraphAttention]:
     return cast(Iterable[GraphAttention], stage)
-
-
-def _after(weight: Tensor, pending: Affine | None) -> Affine:
-    """``weight`` applied after a pending linear map, as one linear map."""
-    if pending is None:
-        return weight, None
-    return weight @ pending[0], None if pending[1] is None else weight @ pending[1]
