@@ -26,6 +26,9 @@ def test_mistakes_in_perturbations_are_one_line():
         "device=cuda",
         "backend=jax",
         "dtype=float16",
+        "compile=inductor",
+        "compile=graph",
+        "matmul=bf16",
         "run_dir=''",
         "experiment.total_frames=0",
         "experiment.num_envs=-2",
@@ -91,3 +94,12 @@ def test_tasks_without_an_arm_need_the_papers_recipe_and_say_so_by_the_first_set
     vmas = ("task=vmas_balance", "algo=mappo", "model=vector_mlp")
     assert refusal(*vmas).startswith("algo.actor.persistence is 0.5: task=vmas_balance does not show")
     assert configure([*vmas, "recipe=paper"]).experiment.train_horizon == 200
+
+
+def test_graphs_are_by_device_and_refused_without_one_in_a_line():
+    assert not compose([]).graphs
+    assert compose(["device=cuda"]).graphs
+    assert not compose(["device=cuda", "compile=none"]).graphs
+    assert refusal("compile=graph") == (
+        "compile=graph with device=cpu: CUDA graphs need device=cuda; choose none or null"
+    )

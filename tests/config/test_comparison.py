@@ -21,7 +21,7 @@ def test_both_values_are_told_by_key_names_first():
 
 
 def test_what_no_number_depends_on_is_free():
-    free = ["seed=0", "run_dir=x", "overwrite=true", "resume=true", "threads=1", "logger=wandb"]
+    free = ["seed=0", "run_dir=x", "overwrite=true", "resume=true", "threads=1", "logger=wandb", "compile=none"]
     one, other = (plain(compose(overrides)) for overrides in ([], [*free, "experiment.checkpoint.keep=9"]))
     assert differences(one, other) == {}
     assert differences({"seed": 1, "task": {"a": 1}}, {"seed": 2, "task": {"a": 2}}, ["seed", "task"]) == {}

@@ -4,7 +4,11 @@ import pytest
 import torch
 from hypothesis import given, settings
 from observations import COUNTS, LEADS, SEEDS, SIZES, observation, randomise, softgm_config
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
+from dense import force_dense
+from round_trips import RoundTrips
 from softgm_bench.envs import entries
 from softgm_bench.models import SoftGMEncoder
 
@@ -175,3 +179,55 @@ def test_parameters_may_be_batched_with_vmap():
     together = torch.vmap(call)(parameters, buffers)
     for model, out in zip(models, together, strict=True):
         torch.testing.assert_close(out, model(td), rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("switches", SWITCHES, ids=str)
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-6), (torch.float64, 1e-12)])
+@pytest.mark.parametrize(("lead", "sensed"), [((2, 5), 0.4), ((3,), 0.0), ((), 1.0)], ids=str)
+def test_masked_slots_equal_packed_edges(switches, dtype, tolerance, lead, sensed):
+    """Forward, gradients and attention of the way that devices go which nobody may wait for."""
+    torch.manual_seed(0)
+    model = SoftGMEncoder(softgm_config(velocity_scale=0.5, hidden=128, heads=4, **switches), SIZES).to(dtype)
+    td = observation(lead, 4, 6, dtype=dtype, sensed=sensed, discovered=float(sensed > 0.0))
+    parameters = list(model.parameters())
+
+    def results():
+        out, weights = model.forward_with_attention(td)
+        return out, weights, torch.autograd.grad(out.square().mean(), parameters, allow_unused=True)
+
+    packed, expected, gradients = results()
+    with force_dense():
+        masked, weights, others = results()
+    rounding = 4 * torch.finfo(dtype).eps * packed.abs().max().item()
+    torch.testing.assert_close(masked, packed, rtol=tolerance, atol=max(tolerance, rounding))
+    assert weights.keys() == expected.keys()
+    for stage in expected:
+        torch.testing.assert_close(weights[stage], expected[stage], rtol=tolerance, atol=tolerance)
+    for one, other in zip(gradients, others, strict=True):
+        if (
+            one is None or other is None
+        ):  # only where there is no edge at all are packed obstacles no part of the result
+            assert one is other or not (one if other is None else other).any()
+        else:
+            torch.testing.assert_close(other, one, rtol=tolerance, atol=tolerance)
+
+
+@pytest.mark.parametrize("gatv2", [False, True])
+def test_what_is_sensed_changes_no_shape_where_nobody_may_look(gatv2):
+    model = encoder(gatv2=gatv2)
+
+    class Shapes(TorchDispatchMode):
+        def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+            out = func(*args, **(kwargs or {}))
+            seen[-1].append((func, [t.shape for t in tree_leaves(out) if isinstance(t, torch.Tensor)]))
+            return out
+
+    seen = []
+    for sensed in (0.0, 0.3, 1.0):
+        seen.append([])
+        model.zero_grad()
+        with force_dense(), Shapes(), RoundTrips() as trips:
+            model(observation((5,), 4, 6, sensed=sensed)).sum().backward()
+        assert trips.found == []
+    # random observations are drawn with the same operations
+    assert seen[0] == seen[1] == seen[2]

@@ -16,6 +16,7 @@ from softgm_bench.algorithms.vector_replay_buffer import VectorReplayBuffer
 from softgm_bench.envs import entries
 from softgm_bench.envs.interface import VECTOR, Environment
 from softgm_bench.models.action_value import ActionValueConfig
+from softgm_bench.upstream import graphs
 from softgm_bench.upstream.soft_update import FusedSoftUpdate
 
 # The team's reward and end of episode, as TorchRL's losses read them: per agent, (B, N, 1).
@@ -156,9 +157,24 @@ class OffPolicy:
         loss.make_value_estimator(ValueEstimators.TD0, gamma=config.gamma)
         self.target_update = FusedSoftUpdate(loss, tau=config.tau)
         self.optimizers: dict[str, torch.optim.Optimizer] = {}
+        self._lr: dict[str, float] = {}  # of each
         self.replay = _make_replay(config.replay_capacity, env, n_privileged)
         self.frames = 0
         self._due = 0.0  # gradient steps, of which whole ones are taken
+        self._recorded: graphs.Recorded | None = None
+
+    def use_graphs(self) -> None:
+        """Take gradient steps as replays of a CUDA graph from now on."""
+        for optimizer in self.optimizers.values():
+            graphs.prepare_optimizer(optimizer)
+        device = next(self.loss.parameters()).device
+        self._recorded = graphs.Recorded(self._step, self._changed, device, "the gradient step")
+
+    def _changed(self) -> list[Tensor]:
+        """Tensors that a gradient step changes: networks, target networks, optimisers."""
+        moments = [tensor for optimizer in self.optimizers.values() for tensor in graphs.optimizer_tensors(optimizer)]
+        held = [value for value in self.loss.state_dict().values() if isinstance(value, Tensor)]
+        return [*held, *moments]
 
     def update(self, batch: TensorDictBase) -> dict[str, float]:
         """Store frames, then take ``updates_per_frame`` gradient steps for each of them.
@@ -174,9 +190,9 @@ class OffPolicy:
         self.frames += batch.numel()
         steps = self._steps_for(batch.numel())
         self.policy.schedule(self.frames)
-        totals = None
+        totals, step = None, self._recorded or self._step
         for _ in range(steps):
-            metrics = self._step(self.sample())
+            metrics = step(self.sample())
             totals = metrics if totals is None else totals + metrics
         # the only look at results: a GPU works through all steps without being waited for
         values = [float("nan")] * len(self._names) if totals is None else (totals / steps).tolist()
@@ -201,7 +217,9 @@ class OffPolicy:
         """Networks, target networks, optimisers, counters, and the replay buffer if ``checkpoint_replay`` says so."""
         state = {
             "loss": self.loss.state_dict(),
-            "optimizers": {name: optimizer.state_dict() for name, optimizer in self.optimizers.items()},
+            "optimizers": {
+                name: graphs.portable_state(optimizer, self._lr[name]) for name, optimizer in self.optimizers.items()
+            },
             "frames": self.frames,
             "due": self._due,
         }
@@ -216,12 +234,15 @@ class OffPolicy:
         for name, optimizer in self.optimizers.items():
             optimizer.load_state_dict(state["optimizers"][name])
         self.frames, self._due = state["frames"], state["due"]
+        if self._recorded is not None:  # the optimisers' tensors are others now
+            self.use_graphs()
         if "replay" in state:
             self.replay.load_state_dict(state["replay"])
         self.policy.schedule(self.frames)
 
     def _optimize(self, name: str, parameters: list[nn.Parameter], lr: float) -> None:
         """Add an optimiser."""
+        self._lr[name] = lr
         self.optimizers[name] = torch.optim.Adam(parameters, lr=lr, eps=ADAM_EPSILON, fused=True)
 
     @property

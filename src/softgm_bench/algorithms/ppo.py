@@ -12,7 +12,6 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 from torchrl.modules.value_norm import PopArtValueNorm
-from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from softgm_bench.algorithms.registry import register_algorithm
@@ -20,6 +19,8 @@ from softgm_bench.algorithms.team import give_to_agents
 from softgm_bench.envs import entries
 from softgm_bench.envs.interface import Environment, Sizes
 from softgm_bench.models.heads import STATE_VALUE, ActorConfig, ValueConfig, build_actor, build_value
+from softgm_bench.upstream import graphs
+from softgm_bench.upstream.ppo_loss import LeanPPOLoss
 
 ADVANTAGE, VALUE_TARGET = "advantage", "value_target"
 REPORTED = ("loss_objective", "loss_critic", "kl_approx", "clip_fraction")
@@ -111,7 +112,7 @@ class PPO:
         known = sizes.n_privileged if oracle or config.critic.asymmetric else 0
         self.policy = self.build_policy(config, model_config, sizes, oracle).to(env.device)
         self.critic = build_value(model_config, sizes, config.critic, config.centralised, known).to(env.device)
-        self.loss = ClipPPOLoss(
+        self.loss = LeanPPOLoss(
             self.policy,
             self.critic,
             clip_epsilon=config.clip_epsilon,
@@ -137,6 +138,23 @@ class PPO:
         self.critic_optimizer = torch.optim.Adam(self._critic_parameters, lr=config.critic_lr, eps=1e-5, fused=True)
         self.trained_frames = 0
         self._kl_scale = 1.0  # of the actor's learning rate
+        self._recorded: graphs.Recorded | None = None
+
+    def use_graphs(self) -> None:
+        """Take gradient steps as replays of a CUDA graph from now on, those on minibatches of the usual size."""
+        for optimizer in self._optimizers:
+            graphs.prepare_optimizer(optimizer)
+        device = self._actor_parameters[0].device
+        self._recorded = graphs.Recorded(self._step, self._changed, device, "PPO's gradient step")
+
+    @property
+    def _optimizers(self) -> tuple[torch.optim.Optimizer, torch.optim.Optimizer]:
+        return self.actor_optimizer, self.critic_optimizer
+
+    def _changed(self) -> list[Tensor]:
+        """Tensors that a gradient step changes."""
+        moments = [tensor for optimizer in self._optimizers for tensor in graphs.optimizer_tensors(optimizer)]
+        return [*self._actor_parameters, *self._critic_parameters, *moments]
 
     def update(self, batch: TensorDictBase) -> dict[str, float]:
         """Improve actor and critic on fresh frames.
@@ -153,12 +171,12 @@ class PPO:
         read = torch.stack([self._epoch(frames) for _ in range(self.config.epochs)]).tolist()
         epochs = [dict(zip(self._names, values, strict=True)) for values in read]
         self.trained_frames += batch.numel()
-        self._set_learning_rates(epochs[-1]["kl_approx"])
+        self._adapt(epochs[-1]["kl_approx"])
+        self._set_learning_rates()
         means = {name: sum(epoch[name] for epoch in epochs) / len(epochs) for name in self._names}
         if not self.loss.entropy_bonus:
             means |= {"loss_entropy": 0.0, "entropy": -batch.get(entries.LOG_PROB).mean().item()}
-        optimizers = {"actor_lr": self.actor_optimizer, "critic_lr": self.critic_optimizer}
-        return means | {name: optimizer.param_groups[0]["lr"] for name, optimizer in optimizers.items()}
+        return means | dict(zip(("actor_lr", "critic_lr"), self._learning_rates, strict=True))
 
     def prepare(self, batch: TensorDictBase) -> TensorDictBase:
         """Estimate advantages and value targets, and flatten to frames ``(num_envs * steps,)``.
@@ -214,30 +232,33 @@ class PPO:
         shuffled = frames[torch.randperm(len(frames), device=frames.device)]
         # a rest much smaller than a minibatch would weigh its few frames too much
         minibatches = [chosen for chosen in shuffled.split(size) if 2 * len(chosen) >= min(size, len(frames))]
-        return torch.stack([self._step(minibatch) for minibatch in minibatches]).mean(0)
+        step = self._recorded or self._step
+        return torch.stack([step(minibatch) for minibatch in minibatches]).mean(0)
 
-    def _set_learning_rates(self, kl: float) -> None:
-        """Learning rates of the next update: the settings, times what is left of a linear schedule's frames.
+    def _adapt(self, kl: float) -> None:
+        """Scale the actor's learning rate so that the policy's change per update stays near ``target_kl``.
 
-        The actor's is also scaled so that the policy's change per update stays near ``target_kl``, held against ``kl``,
-        the mean KL divergence over the last epoch. With a constant step the change grows as sigma shrinks, until
-        updates undo each other. ``actor_lr`` is the upper bound: above it, learning was slower even where the
-        divergence was small.
+        That is held against ``kl``, the mean KL divergence over the last epoch. With a constant step the change grows
+        as sigma shrinks, until updates undo each other. ``actor_lr`` is the upper bound: above it, learning was slower
+        even where the divergence was small.
         """
         config = self.config
         if config.target_kl is not None and kl > LR_MARGIN * config.target_kl:
             self._kl_scale /= LR_FACTOR
         elif config.target_kl is not None and kl < config.target_kl / LR_MARGIN:
             self._kl_scale = min(self._kl_scale * LR_FACTOR, 1.0)
-        left = 1.0
+
+    @property
+    def _learning_rates(self) -> tuple[float, float]:
+        """Actor's and critic's for the next update: the settings, times what is left of a linear schedule's frames."""
+        config, left = self.config, 1.0
         if config.lr_schedule == "linear":
             left = max(0.0, 1.0 - self.trained_frames / config.lr_schedule_frames)
-        for optimizer, lr in (
-            (self.actor_optimizer, config.actor_lr * self._kl_scale),
-            (self.critic_optimizer, config.critic_lr),
-        ):
-            for group in optimizer.param_groups:
-                group["lr"] = lr * left
+        return config.actor_lr * self._kl_scale * left, config.critic_lr * left
+
+    def _set_learning_rates(self) -> None:
+        for optimizer, lr in zip(self._optimizers, self._learning_rates, strict=True):
+            graphs.set_lr(optimizer, lr)
 
     def _step(self, minibatch: TensorDictBase) -> Tensor:
         """One gradient step of actor and critic; metrics in the order of ``_names``."""
@@ -255,10 +276,11 @@ class PPO:
 
     def state_dict(self) -> dict[str, Any]:
         """Networks, optimisers, statistics of the value targets and where the schedules are."""
+        actor_lr, critic_lr = self._learning_rates
         return {
             "loss": self.loss.state_dict(),
-            "actor_optimizer": self.actor_optimizer.state_dict(),
-            "critic_optimizer": self.critic_optimizer.state_dict(),
+            "actor_optimizer": graphs.portable_state(self.actor_optimizer, actor_lr),
+            "critic_optimizer": graphs.portable_state(self.critic_optimizer, critic_lr),
             "value_norm": None if self.value_norm is None else self.value_norm.state_dict(),
             "trained_frames": self.trained_frames,
             "kl_scale": self._kl_scale,
@@ -272,6 +294,8 @@ class PPO:
         if self.value_norm is not None:
             self.value_norm.load_state_dict(state["value_norm"])
         self.trained_frames, self._kl_scale = state["trained_frames"], state["kl_scale"]
+        if self._recorded is not None:  # the optimisers' tensors are others now
+            self.use_graphs()
 
 
 def _standardised(values: Tensor) -> Tensor:

@@ -3,7 +3,7 @@
 import os
 import re
 
-from softgm_bench.config.schema import DTYPES, OBSERVATIONS, Config
+from softgm_bench.config.schema import COMPILES, DTYPES, GRAPHS, MATMULS, OBSERVATIONS, Config
 from softgm_bench.errors import UserError
 from softgm_bench.rod.backend import BACKENDS, check_backend
 
@@ -57,7 +57,15 @@ def _validate_machine(config: Config) -> None:
         raise UserError(f"backend={config.backend}: choose one of {', '.join(BACKENDS)}, or null")
     if config.dtype not in DTYPES:
         raise UserError(f"dtype={config.dtype}: choose one of {', '.join(DTYPES)}")
+    if config.compile is not None and config.compile not in COMPILES:
+        raise UserError(f"compile={config.compile}: choose one of {', '.join(COMPILES)}, or null")
+    if config.matmul is not None and config.matmul not in MATMULS:
+        raise UserError(f"matmul={config.matmul}: choose one of {', '.join(MATMULS)}, or null")
     kind = device_type(config.device)
+    if config.compile == GRAPHS and kind == "cpu":
+        raise UserError(
+            f"compile={GRAPHS} with device={config.device}: CUDA graphs need device=cuda; choose none or null"
+        )
     if config.backend is not None:
         try:
             check_backend(config.backend, kind)

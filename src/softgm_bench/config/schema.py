@@ -8,6 +8,10 @@ from softgm_bench.config.loggers import LoggerConfig
 from softgm_bench.rod.parameters import RodParameters
 
 DTYPES = ("float64", "float32")
+NO_GRAPHS, GRAPHS = "none", "graph"
+COMPILES = (NO_GRAPHS, GRAPHS)
+TF32, FLOAT32 = "tf32", "float32"
+MATMULS = (TF32, FLOAT32)
 OBSERVATIONS = ("standard", "oracle")
 TUNED, PAPER = "tuned", "paper"
 RECIPES = (TUNED, PAPER)
@@ -62,6 +66,8 @@ class Config:
     device: str
     backend: str | None
     dtype: str
+    compile: str | None
+    matmul: str | None
     threads: int | None
     run_dir: str
     overwrite: bool
@@ -78,6 +84,11 @@ class Config:
     def oracle(self) -> bool:
         """Tell whether actors are told what they would have to discover; such a policy is no competitor."""
         return self.observation == "oracle"
+
+    @property
+    def graphs(self) -> bool:
+        """Tell whether what a run repeats is recorded as CUDA graphs."""
+        return (self.compile or (NO_GRAPHS if self.device == "cpu" else GRAPHS)) == GRAPHS
 
     @property
     def label(self) -> str:

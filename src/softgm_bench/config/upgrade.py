@@ -8,6 +8,8 @@ from typing import Any
 NEUTRAL: dict[str, Any] = {
     "recipe": "",
     "resume": False,
+    "compile": None,
+    "matmul": None,
     "experiment.name": "",
     "experiment.minutes": None,
     "task.train_horizon": None,

@@ -5,6 +5,8 @@
 waits for the device: see ``softgm_bench.rod.sync``.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import torch
@@ -22,6 +24,7 @@ from softgm_bench.rod.contact_nodes import contact_nodes
 from softgm_bench.rod.divergence import diverged
 from softgm_bench.rod.parameters import rod_constants
 from softgm_bench.rod.state import RodState, straight_rods
+from softgm_bench.upstream import graphs
 
 
 class Episodes(TensorClass):
@@ -179,6 +182,18 @@ class Simulator:
             self.state.progress.update_(state["curriculum"])
         if "push" in state:
             self.state.push.copy_(state["push"])
+
+    # memory
+
+    @contextmanager
+    def in_place(self) -> Iterator[None]:
+        """Write what is done within into the tensors that the state has now, instead of replacing them."""
+        held = self.state.copy()
+        try:
+            yield
+            graphs.copy_into(graphs.leaves(held), graphs.leaves(self.state))
+        finally:
+            self.state = held
 
     # episodes begin
 

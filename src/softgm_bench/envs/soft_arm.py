@@ -1,6 +1,7 @@
 """``SoftArmEnv``: N sections of one Cosserat-rod arm as cooperating agents, batched over environments."""
 
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -19,6 +20,7 @@ from softgm_bench.rod import sync
 from softgm_bench.rod.actuation import DIRECTIONS
 from softgm_bench.rod.backend import Backend
 from softgm_bench.rod.state import RodState
+from softgm_bench.upstream import graphs
 
 
 def sizes_of(task: Task) -> Sizes:
@@ -241,6 +243,21 @@ class SoftArmEnv(EnvBase):
     def load_simulation_state(self, state: TensorDictBase) -> None:
         """Continue from what ``simulation_state`` returned for as many environments of the same task."""
         self.simulator.load_state(state)
+
+    # CUDA graphs, which repeat what they were recorded with on the same memory
+
+    def in_place(self) -> AbstractContextManager[None]:
+        """Steps and resets within change the simulation's tensors in place."""
+        return self.simulator.in_place()
+
+    def tensors(self) -> list[Tensor]:
+        """Give the tensors that steps ``in_place`` change, each with memory of its own."""
+        self.simulator.state = self.simulator.state.clone()
+        return graphs.leaves(self.simulator.state)
+
+    def generators(self) -> list[torch.Generator]:
+        """Give the generators that steps draw from."""
+        return self.simulator.generators()
 
 
 def _leaves(td: TensorDictBase) -> list[tuple[NestedKey, Tensor]]:

@@ -5,6 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from softgm_bench.rod import sync
 from softgm_bench.upstream import functorch
 
 
@@ -27,7 +28,9 @@ def tanh(x: Tensor) -> Tensor:
     """tanh x within a few units of rounding at 1, absolutely: not for what is close to 0 and matters there."""
     # A function that vmap can take has a ``setup_context``; torch then inspects the signature of ``forward`` at every
     # call, for 0.1 ms, where a layer of a small network takes half of one. Hence torch's own under vmap and its like.
-    return torch.tanh(x) if functorch.transforms_active() else _Tanh.apply(x)
+    # On a GPU torch's is one launch instead of four.
+    plain = functorch.transforms_active() or not sync.is_free(x.device)
+    return torch.tanh(x) if plain else _Tanh.apply(x)
 
 
 class Tanh(nn.Module):

@@ -27,6 +27,20 @@ def entity_attention(own: Tensor, incoming: Tensor | None, sensed: Sensed | None
     return dense.unflatten(0, (-1, n_agents)).movedim(-1, 1)
 
 
+def slot_attention(own: Tensor, incoming: Tensor) -> Tensor:
+    """Stage 1's weights over all nodes, where those of all slots are at hand.
+
+    Args:
+        own: weights of the self-loops of packed agents, ``(B N, H)``.
+        incoming: weights of the slots, ``(B, N, H, M)``.
+
+    Returns:
+        ``(B, H, N, N + M)``.
+    """
+    agents = torch.diag_embed(own.unflatten(0, incoming.shape[:2]).transpose(1, 2))
+    return torch.cat([agents, incoming.transpose(1, 2)], dim=-1)
+
+
 def chain_attention(weights: Tensor) -> Tensor:
     """Stage 2's weights: from ``(3, B, N, H)`` (previous, own, next) to ``(B, H, N, N)``."""
     before, own, after = (part.movedim(-1, 1) for part in weights)

@@ -1,10 +1,12 @@
 """Multi-head graph attention (paper, section "Attention-based Message Passing"; Velickovic et al. 2018).
 
-One set of parameters, three forms of the same layer:
+One set of parameters, five forms of the same layer:
 
 - ``forward``: dense and masked, for any adjacency; the plain reference;
 - ``entity_to_agent``: an edge list from obstacle nodes to agents, plus the agents' self-loops (stage 1);
-- ``chain``: neighbours on a chain plus self-loops (stage 2).
+- ``slots_to_agent``: the same from all slots, masked: shapes do not depend on the edges, and no value is looked at;
+- ``chain``: neighbours on a chain plus self-loops (stage 2);
+- ``chain_masked``: the same as dense attention, in fewer and larger operations.
 
 The GAT score ``a^T [u_i || u_j]`` is split into ``a_target^T u_i + a_source^T u_j``, so no pairwise feature tensor
 exists. Segment operations are ``index_add`` and ``scatter_reduce("amax")``: deterministic on CPU.
@@ -20,6 +22,7 @@ from torch.nn import functional
 from softgm_bench.models.chain_kernel import ChainAttention
 from softgm_bench.upstream import functorch
 
+Affine = tuple[Tensor, Tensor | None]  # weight and offset of a linear map
 NEGATIVE_SLOPE = 0.2  # of LeakyReLU, as in Velickovic et al. 2018; the paper gives none
 
 
@@ -106,12 +109,13 @@ class GraphAttention(nn.Module):
             kept = out if self.gatv2 else out + self.heads
             weight, offset = weight[:kept], None if offset is None else offset[:kept]
         values = functional.linear(nodes, weight, offset)
-        message = values[..., :out].unflatten(-1, (self.heads, self.channels))
+        widths = [out] * (1 + receives) if self.gatv2 else [out, *[self.heads] * (1 + receives)]
+        first, *others = values.split(widths, dim=-1)
+        message = first.unflatten(-1, (self.heads, self.channels))
         if self.gatv2:
-            target = values[..., out:].unflatten(-1, (self.heads, self.channels)) if receives else None
+            target = others[0].unflatten(-1, (self.heads, self.channels)) if receives else None
             return Projection(message, message, target, values)
-        source = values[..., out : out + self.heads]
-        return Projection(message, source, values[..., out + self.heads :] if receives else None, values)
+        return Projection(message, others[0], others[1] if receives else None, values)
 
     def entity_to_agent(
         self, agents: Projection, entities: Projection, source: Tensor, target: Tensor
@@ -136,6 +140,59 @@ class GraphAttention(nn.Module):
         aggregated = own.unsqueeze(-1) * agents.message
         aggregated = aggregated.index_add(0, target, incoming.unsqueeze(-1) * message)
         return self.output(aggregated), own, incoming
+
+    def project_agents(self, agents: Tensor, pending: Affine | None) -> Projection:
+        """What ``project`` gives of nodes that receive, ``(T, in)``, after a linear map that is still to be applied.
+
+        Scores are taken from the messages: on a GPU that is less than to make one matrix of weights at every step.
+        """
+        if self.gatv2:
+            return self.project(agents, *after(self.joint_weight(), pending), receives=True)
+        message = functional.linear(agents, *after(self.weight, pending)).unflatten(-1, (self.heads, self.channels))
+        vectors = torch.stack([self.source, self.target], dim=-1)
+        source, target = torch.bmm(message.transpose(0, 1), vectors).permute(2, 1, 0)
+        return Projection(message, source, target, message)
+
+    def slots_to_agent(
+        self, agents: Projection, slots: Tensor, affine: Affine, absent: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Stage 1 over all slots: each agent hears itself and the slots that it senses.
+
+        The slots' messages are never formed: what is linear can follow the weighted sum over slots as well, which has
+        N H rows an environment instead of M. (GATv2's scores need them.)
+
+        Args:
+            agents: projections of ``B N`` packed agents.
+            slots: nodes ``(B, M, in)``; finite where no agent senses them, too.
+            affine: ``weight``, or a product of it with an earlier linear map: ``(out, in)``, and an offset.
+            absent: what is added to scores, ``(B, N, 1, M)``: 0 where the agent senses the slot, else -inf.
+
+        Returns:
+            New agents ``(B N, out_features)``, weights of self-loops ``(B N, H)`` and of slots ``(B, N, H, M)``.
+        """
+        assert agents.target is not None
+        shape = absent.shape[:2]
+        weight, offset = affine
+        heads = weight.unflatten(0, (self.heads, self.channels))
+        offsets = None if offset is None else offset.unflatten(0, (self.heads, self.channels))
+        target, own = agents.target.unflatten(0, shape), agents.source.unflatten(0, shape)
+        if self.gatv2:
+            message = functional.linear(slots, weight, offset).unflatten(-1, (self.heads, self.channels))
+            pairs = torch.cat([(target + own).unsqueeze(2), target.unsqueeze(2) + message.unsqueeze(1)], dim=2)
+            scores = self._score(pairs).transpose(-1, -2) + functional.pad(absent, (1, 0))
+        else:
+            rows = torch.bmm(self.source.unsqueeze(1), heads).squeeze(1)
+            part = None if offsets is None else (self.source * offsets).sum(-1)
+            source = functional.linear(slots, rows, part).mT.unsqueeze(1) + absent
+            scores = self._score(torch.cat([own.unsqueeze(-1), source], -1) + target.unsqueeze(-1))
+        own_weight, weights = scores.softmax(-1).split([1, slots.shape[1]], -1)
+        mixed = torch.bmm(weights.flatten(1, 2), slots).view(-1, self.heads, slots.shape[-1])
+        incoming = torch.bmm(mixed.transpose(0, 1), heads.mT).transpose(0, 1)  # (B N, H, C)
+        own_weight = own_weight.flatten(0, 1)
+        if offsets is not None:  # as often as the weights say, which with the own one sum to 1
+            incoming = torch.addcmul(incoming, 1.0 - own_weight, offsets)
+        aggregated = torch.addcmul(incoming, own_weight, agents.message)
+        return self.output(aggregated), own_weight.squeeze(-1), weights
 
     def chain(self, agents: Projection, n_agents: int) -> tuple[Tensor, Tensor]:
         """Stage 2: each agent hears itself and its neighbours on the chain.
@@ -163,6 +220,28 @@ class GraphAttention(nn.Module):
         aggregated[:, :-1].add_(after[:, :-1] * message[:, 1:])
         return self.output(aggregated).flatten(0, 1), weights
 
+    def chain_masked(self, agents: Projection, absent: Tensor) -> tuple[Tensor, Tensor]:
+        """Stage 2 over all pairs of agents.
+
+        Args:
+            agents: projections of T packed agents, T a multiple of N.
+            absent: what is added to scores, ``(N, 1, N)``, target first: 0 between neighbours and on the diagonal, else
+                -inf.
+
+        Returns:
+            New agents ``(T, out_features)`` and the weights ``(T / N, N, H, N)``.
+        """
+        assert agents.target is not None
+        n_agents = len(absent)
+        message, source, target = (part.unflatten(0, (-1, n_agents)) for part in agents[:3] if part is not None)
+        if self.gatv2:
+            scores = self._score(target.unsqueeze(2) + source.unsqueeze(1)).transpose(-1, -2)
+        else:
+            scores = self._score(target.unsqueeze(-1) + source.mT.unsqueeze(1))
+        weights = (scores + absent).softmax(-1)
+        aggregated = torch.einsum("binj,bjnc->binc", weights, message)
+        return self.output(aggregated).flatten(0, 1), weights
+
     def _compiles(self, values: Tensor) -> bool:
         """Tell whether ``ChainAttention`` can do it: the paper's scores, on a CPU, under no transform such as vmap."""
         plain = not functorch.is_wrapped(values)
@@ -176,6 +255,13 @@ class GraphAttention(nn.Module):
         """Scores from the sum of the target's and the source's part: ``(..., H)``."""
         pair = functional.leaky_relu(pair, NEGATIVE_SLOPE)
         return (pair * self.source).sum(-1) if self.gatv2 else pair
+
+
+def after(weight: Tensor, pending: Affine | None) -> Affine:
+    """``weight`` applied after a pending linear map, as one linear map."""
+    if pending is None:
+        return weight, None
+    return weight @ pending[0], None if pending[1] is None else weight @ pending[1]
 
 
 def edge_softmax(own: Tensor, incoming: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:

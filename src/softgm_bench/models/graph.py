@@ -4,6 +4,8 @@ Shapes: ``...`` are any leading batch dimensions (time, environment), N agents, 
 paper's: the N agents first, then the M slots. Contract with the environment: an edge exists only from an active slot.
 """
 
+import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
@@ -30,8 +32,11 @@ __all__ = [  # with the views, so that models name one module
     "OBSTACLE",
     "PAD",
     "Sensed",
+    "absent_neighbours",
+    "absent_slots",
     "agent_channels",
     "agent_features",
+    "all_slots",
     "chain_adjacency",
     "flat_features",
     "flat_observation",
@@ -86,6 +91,29 @@ def full_adjacency(td: TensorDictBase) -> Tensor:
 def pad_channels(channels: Tensor) -> Tensor:
     """Append the paper's reserved zeros: ``(..., 15)`` to ``(..., 22)``."""
     return torch.nn.functional.pad(channels, (0, NODE_FEATURES - CHANNELS))
+
+
+@lru_cache
+def absent_neighbours(n_agents: int, device: torch.device, dtype: torch.dtype) -> Tensor:
+    """0 between an agent and itself or a neighbour on the chain, else -inf: ``(N, 1, N)``, target first.
+
+    Made once, and not to be changed.
+    """
+    apart = torch.full((n_agents, n_agents), -math.inf, device=device, dtype=dtype)
+    return (apart.triu(2) + apart.tril(-2)).unsqueeze(1)
+
+
+def absent_slots(td: TensorDictBase) -> Tensor:
+    """0 where an agent senses a slot, else -inf: ``(B, N, 1, M)``, leading dimensions packed into B."""
+    edge = td[entries.EDGE]
+    return edge.to(td[entries.SLOT_DESCRIPTOR].dtype).log().reshape(-1, edge.shape[-2], 1, edge.shape[-1])
+
+
+def all_slots(td: TensorDictBase) -> Tensor:
+    """Features of all slots, ``(B, M, 15)``, leading dimensions packed into B; those of PAD are finite, no more."""
+    descriptor = td[entries.SLOT_DESCRIPTOR]
+    target, tip = td[entries.TARGET].unsqueeze(-2), td[entries.TIP].unsqueeze(-2)
+    return obstacle_channels(descriptor, target, tip).reshape(-1, descriptor.shape[-2], CHANNELS)
 
 
 class Sensed(NamedTuple):

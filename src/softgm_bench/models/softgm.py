@@ -1,9 +1,10 @@
 """SoftGM's encoder: two stages of graph attention (paper, section "Attention-based Message Passing").
 
 Cheap by construction. Only obstacle slots with an edge to some agent are computed: slots hear nobody, so one without an
-edge cannot influence any agent. Nothing between ``W_in`` and the first attention layer is nonlinear, so their matrices
-are multiplied first and ``h^(0)`` is never formed (unless a residual connection needs it). ``forward_dense`` is the
-paper's text, all nodes and masked, with the same parameters; the two agree to rounding.
+edge cannot influence any agent. On a device that must not be waited for (``softgm_bench.rod.sync``) all slots are
+computed and masked instead, in shapes that no value decides on. Nothing between ``W_in`` and the first attention layer
+is nonlinear, so their matrices are multiplied first and ``h^(0)`` is never formed (unless a residual connection needs
+it). ``forward_dense`` is the paper's text, all nodes and masked, with the same parameters; the forms agree to rounding.
 
 Where the paper is silent: ELU after every layer but the very last, a bias in every layer, and heads concatenated in all
 of them (Velickovic et al. 2018 average them in a classifier's last layer).
@@ -21,9 +22,10 @@ from torch.nn import functional
 from softgm_bench.envs import entries
 from softgm_bench.envs.interface import Sizes
 from softgm_bench.models import graph
-from softgm_bench.models.attention import chain_attention, entity_attention, stack_layers
-from softgm_bench.models.gat import GraphAttention
+from softgm_bench.models.attention import chain_attention, entity_attention, slot_attention, stack_layers
+from softgm_bench.models.gat import Affine, GraphAttention, after
 from softgm_bench.models.registry import Encoder, register_model
+from softgm_bench.rod import sync
 
 
 @dataclass
@@ -65,7 +67,6 @@ class SoftGMConfig:
                 raise ValueError(f"model.{name} is {getattr(self, name)}: it must be at least {lowest}")
 
 
-Affine = tuple[Tensor, Tensor | None]  # weight and offset of a linear map that is still to be applied
 Record = list[Tensor] | None  # where to leave the attention of each layer
 
 
@@ -129,7 +130,8 @@ class SoftGMEncoder(Encoder):
         shape = td[entries.EDGE].shape[-2:]
         agents, pending = self._enter(channels.flatten(0, -2), graph.AGENT)  # packed: (B N, 15 or hidden)
         if len(self.stage1):
-            agents = self._entity_stage(td, agents, pending, stage1)
+            entity_stage = self._entity_stage if sync.is_free(channels.device) else self._slot_stage
+            agents = entity_stage(td, agents, pending, stage1)
             pending = None
         if len(self.stage2):
             agents = self._agent_stage(agents, pending, shape[0], stage2)
@@ -143,12 +145,12 @@ class SoftGMEncoder(Encoder):
         for depth, layer in enumerate(_layers(self.stage1), start=1):
             last = depth == len(self.stage1)
             weight = layer.joint_weight()
-            own = layer.project(agents, *_after(weight, pending), receives=True)
+            own = layer.project(agents, *after(weight, pending), receives=True)
             own_weights, edge_weights = None, None
             if sensed is None:  # every agent hears only itself
                 out = layer.output(own.message)
             else:
-                other = layer.project(entities, *_after(weight, entity_pending), receives=False)
+                other = layer.project(entities, *after(weight, entity_pending), receives=False)
                 out, own_weights, edge_weights = layer.entity_to_agent(own, other, sensed.source, sensed.target)
                 if not last:  # an obstacle node hears only itself; nobody reads what the last layer makes of it
                     entities, entity_pending = self._between(layer.output(other.message), entities, last=False), None
@@ -158,14 +160,35 @@ class SoftGMEncoder(Encoder):
                 record.append(entity_attention(own_weights, edge_weights, sensed, td[entries.EDGE].shape[-2:]))
         return agents
 
+    def _slot_stage(self, td: TensorDictBase, agents: Tensor, pending: Affine | None, record: Record) -> Tensor:
+        """Stage 1 as ``_entity_stage`` computes it, from all M slots."""
+        absent = graph.absent_slots(td)
+        slots, slot_pending = self._enter(graph.all_slots(td), graph.OBSTACLE)  # (B, M, 15 or hidden)
+        for depth, layer in enumerate(_layers(self.stage1), start=1):
+            last = depth == len(self.stage1)
+            affine = after(layer.weight, slot_pending)
+            own = layer.project_agents(agents, pending)
+            out, own_weights, slot_weights = layer.slots_to_agent(own, slots, affine, absent)
+            if not last:  # a slot hears only itself, as obstacles do
+                message = functional.linear(slots, *affine) + layer.bias
+                slots, slot_pending = self._between(message, slots, last=False), None
+            agents, pending = self._between(out, agents, last=last and not len(self.stage2)), None
+            if record is not None:
+                record.append(slot_attention(own_weights, slot_weights))
+        return agents
+
     def _agent_stage(self, agents: Tensor, pending: Affine | None, n_agents: int, record: Record) -> Tensor:
         """Stage 2: ``(B N, hidden)`` after L layers of agent <-> agent messages."""
+        absent = None if sync.is_free(agents.device) else graph.absent_neighbours(n_agents, agents.device, agents.dtype)
         for depth, layer in enumerate(_layers(self.stage2), start=1):
-            own = layer.project(agents, *_after(layer.joint_weight(), pending), receives=True)
-            out, weights = layer.chain(own, n_agents)
+            if absent is None:
+                own = layer.project(agents, *after(layer.joint_weight(), pending), receives=True)
+                out, weights = layer.chain(own, n_agents)
+            else:
+                out, weights = layer.chain_masked(layer.project_agents(agents, pending), absent)
             agents, pending = self._between(out, agents, last=depth == len(self.stage2)), None
             if record is not None:
-                record.append(chain_attention(weights))
+                record.append(chain_attention(weights) if absent is None else weights.transpose(1, 2))
         return agents
 
     def _enter(self, channels: Tensor, node_type: int) -> tuple[Tensor, Affine | None]:
@@ -185,10 +208,3 @@ class SoftGMEncoder(Encoder):
 
 def _layers(stage: nn.ModuleList) -> Iterable[GraphAttention]:
     return cast(Iterable[GraphAttention], stage)
-
-
-def _after(weight: Tensor, pending: Affine | None) -> Affine:
-    """``weight`` applied after a pending linear map, as one linear map."""
-    if pending is None:
-        return weight, None
-    return weight @ pending[0], None if pending[1] is None else weight @ pending[1]

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
+from softgm_bench.algorithms import Algorithm
 from softgm_bench.assembly import build_algorithm, build_env
 from softgm_bench.config import Config, plain
 from softgm_bench.episodes.evaluation import EpisodeRecords
@@ -20,13 +21,13 @@ from softgm_bench.runs.budget import Budget
 from softgm_bench.runs.interruption import Interrupted, Interruption
 from softgm_bench.runs.loggers.guarded import Loggers
 from softgm_bench.runs.loggers.video import episode_video
-from softgm_bench.runs.machine import keep_memory, set_threads
+from softgm_bench.runs.machine import keep_memory, set_matmul, set_threads
 from softgm_bench.runs.metrics import CsvWriter, EpisodeTracker, step_metrics
 from softgm_bench.runs.progress import Progress
 from softgm_bench.runs.run import Run, derive_seeds, frames_per_iteration, total_frames
 from softgm_bench.storage.files import to_json
 from softgm_bench.storage.run_folder import RunFolder
-from softgm_bench.upstream.collector import FrameCollector
+from softgm_bench.upstream.collector import FrameCollector, RecordingCollector
 
 
 def train(config: Config) -> dict[str, Any]:
@@ -78,14 +79,28 @@ def _build(config: Config) -> Run:
     started, budget = time.perf_counter(), Budget(config.experiment.minutes)
     seeds = derive_seeds(config.seed)
     set_threads(config.threads)
+    if config.device != "cpu":
+        set_matmul(config.matmul)
     keep_memory()
     torch.manual_seed(seeds.torch)
     experiment = config.experiment
     env = build_env(config, experiment.num_envs, seeds.training, experiment.train_horizon, training=True)
     algorithm = build_algorithm(config, env)
-    collector = FrameCollector(env, algorithm.policy, frames_per_iteration(config))
+    collector = _collector(config, env, algorithm)
     episodes = EpisodeTracker(experiment.num_envs, config.device)
     return Run(config, RunFolder(Path(config.run_dir)), seeds, env, algorithm, collector, episodes, started, budget)
+
+
+def _collector(config: Config, env: Any, algorithm: Algorithm) -> FrameCollector:
+    """A collector and, in ``algorithm``, gradient steps that are recorded as CUDA graphs, as far as the settings say.
+
+    A policy whose exploration follows a schedule changes in other ways than a recording can see.
+    """
+    if config.graphs and hasattr(algorithm, "use_graphs"):
+        algorithm.use_graphs()
+    recorded = config.graphs and hasattr(env, "in_place") and not hasattr(algorithm.policy, "schedule")
+    kind = RecordingCollector if recorded else FrameCollector
+    return kind(env, algorithm.policy, frames_per_iteration(config))
 
 
 def _begin(run: Run) -> None:

@@ -8,6 +8,7 @@ import torch
 
 from softgm_bench import process
 from softgm_bench.config import available_threads
+from softgm_bench.config.schema import FLOAT32
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # glibc's malloc.h
 
@@ -27,6 +28,11 @@ def set_threads(threads: int | None) -> int:
     if not _products_are_float32():  # a product came before ``process.prepare``, which then had no effect
         matmul.fp32_precision = usual
     return count
+
+
+def set_matmul(precision: str | None) -> None:
+    """Let matrix products of float32 on a GPU be rounded to ``tf32`` or stay ``float32``; None: tf32."""
+    torch.backends.cuda.matmul.fp32_precision = "ieee" if precision == FLOAT32 else "tf32"
 
 
 def keep_memory() -> None:

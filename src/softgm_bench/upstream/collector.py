@@ -3,11 +3,15 @@
 from collections.abc import Mapping
 from typing import Any
 
-from tensordict import TensorDict
+import torch
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
-from torchrl.envs.utils import ExplorationType
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from softgm_bench.upstream.graphs import Recorded, copy_into, leaves
 
 
 class FrameCollector(Collector):
@@ -42,3 +46,51 @@ class FrameCollector(Collector):
     def show(self, frame: Mapping[str, Any]) -> None:
         """Resume from what ``shown`` returned; the environment must be put where it was then, too."""
         self._carrier.update(TensorDict(dict(frame), self._carrier.batch_size, device=self._carrier.device))
+
+
+class RecordingCollector(FrameCollector):
+    """``FrameCollector`` whose step of policy and environment is recorded once as a CUDA graph and replayed.
+
+    The first batch is collected without a graph and says what the frames look like. The environment has, beside what
+    an ``EnvBase`` has, ``in_place``, ``tensors`` and ``generators`` (see ``SoftArmEnv``); the policy is a function of
+    its parameters and its input, and explores by the device's default generator.
+    """
+
+    _carrier: TensorDictBase  # what the policy is shown next
+
+    def __init__(self, env: Any, policy: TensorDictModuleBase, frames_per_batch: int) -> None:
+        """Arguments as of ``FrameCollector``."""
+        super().__init__(env, policy, frames_per_batch)
+        self._batch: Any = None  # (num_envs, steps)
+        self._time = torch.zeros(1, dtype=torch.int64, device=env.device)  # of the frame to be collected
+        self._advance = Recorded(self._step, self._changed, env.device, "collection", env.generators())
+
+    def show(self, frame: Mapping[str, Any]) -> None:
+        """Resume from what ``shown`` returned."""
+        super().show(frame)
+        self._batch = None
+        self._advance.forget()
+
+    def rollout(self) -> TensorDictBase:
+        """Collect a batch ``(num_envs, steps)``, which the next one overwrites."""
+        if self._advance.failed or self._batch is None:
+            self._batch = super().rollout()
+            self._carrier = self._carrier.clone()
+            return self._batch
+        self._time.zero_()
+        for _ in range(self._batch.shape[1]):
+            self._advance()
+        return self._batch
+
+    @torch.no_grad()
+    def _step(self) -> None:
+        """Collect one frame, with every tensor that changes changed in place."""
+        with set_exploration_type(ExplorationType.RANDOM), self.env.in_place():
+            frame, following = self.env.step_and_maybe_reset(self.policy(self._carrier.copy()))
+        for column, value in zip(leaves(self._batch), leaves(frame), strict=True):
+            column.index_copy_(1, self._time, value.unsqueeze(1))
+        self._time.add_(1).remainder_(self._batch.shape[1])
+        copy_into(leaves(self._carrier), leaves(following))
+
+    def _changed(self) -> list[Tensor]:
+        return [self._time, *leaves(self._carrier), *self.env.tensors()]
