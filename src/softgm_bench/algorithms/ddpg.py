@@ -29,9 +29,11 @@ class DeterministicActorConfig:
 
     Attributes:
         widths: hidden layers, each followed by tanh.
+        embedding_norm: g_i is normalised before it enters the head (paper: no); see ``models.registry.Normalised``.
     """
 
     widths: list[int]
+    embedding_norm: bool
 
 
 @dataclass
@@ -104,7 +106,8 @@ class DDPG(OffPolicy):
     ) -> NoisyExplorer:
         """Build the actor alone; see ``algorithms.build_policy``."""
         known = sizes.n_privileged if oracle else 0
-        actor = DeterministicPolicy(build_encoder(model_config, sizes), sizes.action, config.actor, known)
+        encoder = build_encoder(model_config, sizes, config.actor.embedding_norm)
+        actor = DeterministicPolicy(encoder, sizes.action, config.actor, known)
         return NoisyExplorer(actor, sizes.action, config, frames)
 
     def __init__(self, config: DDPGConfig, model_config: Any, env: Environment, oracle: bool = False) -> None:

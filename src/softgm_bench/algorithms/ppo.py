@@ -19,7 +19,14 @@ from softgm_bench.algorithms.registry import register_algorithm
 from softgm_bench.algorithms.team import give_to_agents
 from softgm_bench.envs import entries
 from softgm_bench.envs.interface import Environment, Sizes
-from softgm_bench.models.heads import STATE_VALUE, ActorConfig, ValueConfig, build_actor, build_value
+from softgm_bench.models.heads import (
+    STATE_VALUE,
+    ActorConfig,
+    ValueConfig,
+    actor_saturation,
+    build_actor,
+    build_value,
+)
 
 ADVANTAGE, VALUE_TARGET = "advantage", "value_target"
 REPORTED = ("loss_objective", "loss_critic", "kl_approx", "clip_fraction")
@@ -146,7 +153,8 @@ class PPO:
 
         Returns:
             Means over all minibatches of losses, entropy, KL divergence, clip fraction and gradient norms; the learning
-            rates that the next update begins with. Without an entropy bonus, entropy is that of the frames' actions.
+            rates that the next update begins with; how saturated the actor's head is. Without an entropy bonus, entropy
+            is that of the frames' actions.
         """
         frames = self.prepare(batch)
         # results are first looked at here: a GPU works through all minibatches without being waited for
@@ -158,7 +166,8 @@ class PPO:
         if not self.loss.entropy_bonus:
             means |= {"loss_entropy": 0.0, "entropy": -batch.get(entries.LOG_PROB).mean().item()}
         optimizers = {"actor_lr": self.actor_optimizer, "critic_lr": self.critic_optimizer}
-        return means | {name: optimizer.param_groups[0]["lr"] for name, optimizer in optimizers.items()}
+        means |= {name: optimizer.param_groups[0]["lr"] for name, optimizer in optimizers.items()}
+        return means | actor_saturation(self.policy, batch)
 
     def prepare(self, batch: TensorDictBase) -> TensorDictBase:
         """Estimate advantages and value targets, and flatten to frames ``(num_envs * steps,)``.

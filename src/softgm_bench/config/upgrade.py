@@ -11,6 +11,8 @@ NEUTRAL: dict[str, Any] = {
     "experiment.name": "",
     "task.train_horizon": None,
     "task.hidden_scene": False,
+    "algo.actor.embedding_norm": False,
+    "algo.critic.embedding_norm": False,
 }
 ABLATIONS = ("softgm_no_stage1", "softgm_no_stage2")  # algorithms then, models of the algorithm softgm now
 
