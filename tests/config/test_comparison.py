@@ -36,7 +36,8 @@ def test_a_part_that_only_one_has_differs_in_each_of_its_keys():
 
 def test_a_run_from_before_there_were_named_recipes_is_the_same_run_but_for_what_is_new_in_a_recipe():
     """What a recipe or an experiment stands for is compared, not what it is called."""
-    new = {"algo.actor.embedding_norm": (True, False), "algo.critic.embedding_norm": (True, False)}
+    keys = ("algo.actor.embedding_norm", "algo.critic.embedding_norm", "algo.actor.relative_points")
+    new = dict.fromkeys(keys, (True, False))
     for recipe, expected in (("tuned", new), ("paper", {})):
         today = plain(compose(["task=wall", f"recipe={recipe}", "experiment=quick"]))
         before = OmegaConf.create(today)

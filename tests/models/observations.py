@@ -67,6 +67,7 @@ def actor_config(**changes):
         "mean_bound": 3.0,
         "persistence": 0.0,
         "embedding_norm": False,
+        "relative_points": False,
     }
     return ActorConfig(**(values | changes))
 

@@ -1,4 +1,5 @@
 import itertools
+from dataclasses import replace
 
 import pytest
 import torch
@@ -187,6 +188,30 @@ def test_privileged_channels_enter_the_heads_that_are_built_for_them_and_no_othe
             value = build_value(softgm_config(), SIZES, value_config(pooling=pooling), centralised, known)
             assert (entries.PRIVILEGED in value.in_keys) is bool(known)
             assert same(value, STATE_VALUE) is not bool(known)
+
+
+def test_an_oracles_actor_is_told_a_point_as_it_is_told_the_target():
+    """Were the opening's centre the target, both would be told every agent alike."""
+    sizes = replace(SIZES, n_privileged=4, n_points=1)
+    torch.manual_seed(0)
+    policy = build_actor(softgm_config(), sizes, actor_config(relative_points=True), sizes.n_privileged)
+    td = observation((5,))
+    td[entries.PRIVILEGED] = torch.cat([td[entries.TARGET], torch.full((5, 1), 0.3)], dim=-1)
+    inputs = policy.module[0].head.inputs(td)
+    known, relative = inputs[..., -7:-3], inputs[..., -3:]
+    assert torch.equal(known, td[entries.PRIVILEGED].unsqueeze(-2).expand(5, 4, 4))
+    assert torch.equal(relative, graph.agent_channels(td)[..., 9:12])
+    absolute = build_actor(softgm_config(), sizes, actor_config(), sizes.n_privileged).module[0].head
+    assert torch.equal(absolute.inputs(td)[..., -4:], known)
+    assert absolute.function[0].in_features == inputs.shape[-1] - 3
+
+
+def test_only_an_oracles_actor_is_told_points():
+    sizes = replace(SIZES, n_privileged=4, n_points=1)
+    for relative in (False, True):
+        policy = build_actor(softgm_config(), sizes, actor_config(relative_points=relative))
+        assert set(policy.in_keys) == set(entries.OBSERVATION)
+        assert policy.module[0].head.function[0].in_features == graph.CHANNELS + 8
 
 
 def test_an_unknown_pooling_is_refused():

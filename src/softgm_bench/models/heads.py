@@ -23,6 +23,7 @@ from torch import Tensor, nn
 
 from softgm_bench.envs import entries
 from softgm_bench.envs.interface import Sizes
+from softgm_bench.models import graph
 from softgm_bench.models.activation import Tanh
 from softgm_bench.models.mlp import MLPConfig
 from softgm_bench.models.registry import Encoder, TeamEncoder, build_encoder, build_team_encoder
@@ -50,6 +51,7 @@ class ActorConfig:
         persistence: share p of the previous action in the pre-tanh mean, ``p atanh(a_{t-1}) + (1 - p) mu`` (paper: 0).
             Above 0, exploration is correlated in time: it moves a slow arm where independent noise only shakes it.
         embedding_norm: g_i is normalised before it enters the head (paper: no); see ``models.registry.Normalised``.
+        relative_points: an oracle's actor is told the privileged points relative to each agent too.
     """
 
     widths: list[int]
@@ -60,6 +62,7 @@ class ActorConfig:
     mean_bound: float
     persistence: float
     embedding_norm: bool
+    relative_points: bool
 
     def __post_init__(self) -> None:
         """Refuse values that give no policy.
@@ -136,17 +139,27 @@ def feedforward(in_features: int, widths: Sequence[int], out_features: int, last
 class AgentHead(nn.Module):
     """``f([o_i || g_i])`` for every agent with shared parameters; o_i is the agent's own node (15 channels).
 
-    With privileged channels w it is ``f([o_i || g_i || w])``.
+    With privileged channels w it is ``f([o_i || g_i || w])``; with points p_k among them, ``f([o_i || g_i || w ||
+    p_1 - p_i || ..])`` with p_i the agent's position, as o_i holds the target.
     """
 
     def __init__(
-        self, encoder: Encoder, widths: Sequence[int], out_features: int, last_gain: float, n_privileged: int = 0
+        self,
+        encoder: Encoder,
+        widths: Sequence[int],
+        out_features: int,
+        last_gain: float,
+        n_privileged: int = 0,
+        n_points: int = 0,
     ) -> None:
-        """Put f (hidden layers ``widths``, last layer scaled by ``last_gain``) on an encoder, which gives g_i."""
+        """Put f (hidden layers ``widths``, last layer scaled by ``last_gain``) on an encoder, which gives g_i.
+
+        Of the ``n_privileged`` channels ``n_points`` points are given relative to each agent too.
+        """
         super().__init__()
         self.encoder = encoder
-        self.n_privileged = n_privileged
-        in_features = encoder.own_features + encoder.out_features + n_privileged
+        self.n_privileged, self.n_points = n_privileged, n_points
+        in_features = encoder.own_features + encoder.out_features + n_privileged + 3 * n_points
         self.function = feedforward(in_features, widths, out_features, last_gain)
 
     def forward(self, td: TensorDictBase) -> Tensor:
@@ -159,6 +172,8 @@ class AgentHead(nn.Module):
         if self.n_privileged:
             known = td.get(entries.PRIVILEGED).unsqueeze(-2)
             parts.append(known.expand(*parts[0].shape[:-1], self.n_privileged))
+        if self.n_points:
+            parts.append(graph.relative_points(td, self.n_points))
         return torch.cat(parts, dim=-1)
 
 
@@ -191,12 +206,14 @@ def actor_saturation(policy: nn.Module, batch: TensorDictBase) -> dict[str, floa
 class GaussianPolicy(TensorDictModuleBase):
     """Writes the pre-tanh mean ``LOC`` and standard deviation ``SCALE`` of every agent's action, ``(..., N, 2)``."""
 
-    def __init__(self, encoder: Encoder, actions: int, config: ActorConfig, n_privileged: int = 0) -> None:
+    def __init__(
+        self, encoder: Encoder, actions: int, config: ActorConfig, n_privileged: int = 0, n_points: int = 0
+    ) -> None:
         """Put the policy's head on an encoder; ``actions`` is A, the numbers in one agent's action."""
         super().__init__()
         self.in_keys, self.out_keys = input_keys(encoder, n_privileged), [LOC, SCALE]
         outputs = 2 * actions if config.state_dependent_sigma else actions
-        self.head = AgentHead(encoder, config.widths, outputs, last_gain=0.01, n_privileged=n_privileged)
+        self.head = AgentHead(encoder, config.widths, outputs, 0.01, n_privileged, n_points)
         self.persistence = config.persistence
         self.low, self.range = math.log(config.min_sigma), math.log(config.max_sigma / config.min_sigma)
         fraction = torch.tensor((math.log(config.initial_sigma) - self.low) / self.range)
@@ -260,6 +277,11 @@ class AgentValue(TensorDictModuleBase):
         return td.set(STATE_VALUE, self.head(td))
 
 
+def told_points(config: Any, sizes: Sizes, n_privileged: int) -> int:
+    """Number of points that an actor of these settings is told relative to each agent; only an oracle's is any."""
+    return sizes.n_points if n_privileged and config.relative_points else 0
+
+
 def build_actor(
     encoder_config: Any, sizes: Sizes, config: ActorConfig, n_privileged: int = 0
 ) -> ProbabilisticTensorDictSequential:
@@ -273,7 +295,7 @@ def build_actor(
     policy would not be one. Losses that need the exact pathwise sample (SAC) take it from ``get_dist``.
     """
     encoder = build_encoder(encoder_config, sizes, config.embedding_norm)
-    policy = GaussianPolicy(encoder, sizes.action, config, n_privileged)
+    policy = GaussianPolicy(encoder, sizes.action, config, n_privileged, told_points(config, sizes, n_privileged))
     sample = ProbabilisticTensorDictModule(
         in_keys={"loc": LOC, "scale": SCALE},
         out_keys=[entries.ACTION],
