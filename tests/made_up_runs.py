@@ -88,7 +88,14 @@ def write_run(
 
 
 def write_evaluation(
-    folder: Path, task: str, label: str, seed: int, perturbation: dict, success: float = 0.6, overrides: tuple = ()
+    folder: Path,
+    task: str,
+    label: str,
+    seed: int,
+    perturbation: dict,
+    success: float = 0.6,
+    overrides: tuple = (),
+    **further: object,
 ) -> Path:
     """An evaluation beside training."""
     folder.mkdir(parents=True)
@@ -105,7 +112,7 @@ def write_evaluation(
         "overrides": list(overrides),
         "metrics": metrics(columns),
     }
-    (folder / "summary.json").write_text(json.dumps(summary))
+    (folder / "summary.json").write_text(json.dumps(summary | further))
     return folder
 
 

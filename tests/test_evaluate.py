@@ -89,6 +89,8 @@ def test_an_evaluation_leaves_its_episodes_and_a_summary_of_them(run, tmp_path):
         "deterministic": True,
         "horizon": 4,
         "batch": None,
+        "intervention": "none",
+        "device": "cpu",
         "discount": 0.99,
         "threads": 1,
         "overrides": ["rod.n_elements=20", "task=wall", "perturbation=noise", "perturbation.position_sigma=0.2"],
@@ -135,6 +137,9 @@ def test_a_run_keeps_its_evaluations_and_a_file_has_them_elsewhere(run, tmp_path
         ),
         ("run/checkpoints/" + kept.name,): f"run/evaluations/basic_{small}_horizon-4_none_seed0_frames{frames}",
         (SOFTGM,): f"outputs/evaluations/basic_softgm/basic_{small}_horizon-4_none_seed0",
+        (SOFTGM, "task=wall", "intervention=blind"): (
+            f"outputs/evaluations/basic_softgm/wall_{small}_horizon-4_intervention-blind_none_seed0"
+        ),
     }
     for arguments, folder in expected.items():
         status, out, err = run(*QUICK, *arguments)
@@ -198,6 +203,8 @@ MISTAKES = {
     "no horizon": ([SOFTGM, "horizon=0"], "horizon=0: it must be at least 1"),
     "negative seed": ([SOFTGM, "seed=-1"], "seed=-1: a seed is a whole number from 0 to 2**63 - 1"),
     "no discount": ([SOFTGM, "gamma=1.5"], "gamma=1.5: it must lie between 0 and 1"),
+    "no such intervention": ([SOFTGM, "intervention=deaf"], "intervention=deaf: choose one of none, blind, "),
+    "nothing to hide": ([SOFTGM, "intervention=blind"], "intervention=blind: task=basic shows no obstacles"),
     "too many threads": ([SOFTGM, "threads=1000"], "threads=1000: choose 1 to "),
     "no such device": ([SOFTGM, "device=tpu"], "device=tpu: choose cpu, cuda or cuda:<index>"),
     "the other device's kernel": (

@@ -31,6 +31,14 @@ def made(tmp_path_factory):
     for seed in range(3):
         folder = write_run(root / "runs", "wall", "softgm", seed, success=0.5)
         write_evaluation(folder / "evaluations" / "n", "wall", "softgm", seed, {"name": "noise", "position_sigma": 0.1})
+    beside = root / "runs" / "wall" / "softgm" / "seed0" / "evaluations"
+    for name, success, further in (
+        ("plain", 0.9, {}),
+        ("blind", 0.1, {"intervention": "blind"}),
+        ("other", 0.1, {"intervention": "blind", "evaluation_seed": 9}),
+    ):
+        further |= {"overrides": ("rod.substeps=50",)}  # not Table II's
+        write_evaluation(beside / name, "wall", "softgm", 0, {"name": "none"}, success, **further)
     write_run(root / "runs", "wall", "mappo", 0, success=0.3)
     write_run(root / "runs", "wall", "mappo_oracle", 0, success=1.0, observation="oracle")
     write_run(root / "runs", "wall", "softgm_no_stage1", 0, success=0.1)
@@ -120,8 +128,21 @@ def test_every_source_is_named(made):
     text = (made / "out" / "report.md").read_text()
     assert len(rows(text, "Every run that")) == 7
     assert {row[-1] for row in rows(text, "Every evaluation")} == {
-        f"runs/wall/softgm/seed{seed}/evaluations/n" for seed in range(3)
+        *(f"runs/wall/softgm/seed{seed}/evaluations/n" for seed in range(3)),
+        *(f"runs/wall/softgm/seed0/evaluations/{name}" for name in ("plain", "blind", "other")),
     }
+
+
+def test_interventions_are_compared_with_the_same_episodes_without(made):
+    compared, refused = rows((made / "out" / "report.md").read_text(), "Interventions:")
+    assert compared[:6] == ["Wall with hole", "SoftGM", "Nominal", "blind", "0", "100"]
+    without, under, difference = (float(cell.replace("−", "-")) for cell in compared[6:9])
+    assert difference == pytest.approx(under - without)
+    assert difference < -50
+    lost, won = map(int, compared[9:11])
+    assert lost - won == pytest.approx(without - under)
+    assert float(compared[11]) < 1e-6
+    assert refused[6:] == [*["—"] * 6, "not the same scenes: seed 9 and 1"]
 
 
 def test_the_page_holds_every_figure_and_no_path_of_the_machine(made):

@@ -140,6 +140,7 @@ def evaluate(
     horizon: int | None = None,
     gamma: float = DISCOUNT,
     batch: int | None = None,
+    intervention: str = "none",
     out: str | Path | None = None,
 ) -> Evaluation:
     """Play ``episodes`` episodes that training has never seen, as ``python -m softgm_bench.evaluate`` does.
@@ -153,11 +154,13 @@ def evaluate(
         horizon: control steps of an episode; None: the task's own.
         gamma: of the discounted return.
         batch: environments at once, to save memory; None: all. Others play other episodes.
+        intervention: what the policy is shown in place of what its agents see; see ``episodes.interventions``.
         out: folder for ``episodes.csv`` and ``summary.json``; None: nothing is written.
     """
-    protocol = Protocol(episodes, seed, deterministic, horizon, gamma, batch)
+    protocol = Protocol(episodes, seed, deterministic, horizon, gamma, batch, intervention)
     protocol.check()
     trained = _loaded(source, overrides)
+    protocol.check_fits(trained)
     if out is not None:
         evaluation_folder.check(Path(out), overwrite=False)
     records = protocol.play(trained)

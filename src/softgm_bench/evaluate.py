@@ -8,6 +8,9 @@ SOURCE is a run folder (its newest checkpoint), a checkpoint or a policy's file.
   horizon=null         control steps of an episode; null: the task's own
   gamma=0.99           of the discounted return
   batch=null           environments at once, to save memory; null: all. Other batches play other episodes
+  intervention=none    what the policy is shown in place of what its agents see, on the same scenes: blind, no obstacle;
+                       swap_obstacles, another scene's; sensed_only, none from memory; hide_lengths, without their
+                       lengths; swap_opening, an oracle is told another scene's opening
   threads=null         null: every core that this process may use
   device=cpu           cpu, cuda or cuda:<index>
   out=null             folder for episodes.csv and summary.json; null: SOURCE/evaluations/... of a run folder,
@@ -72,7 +75,10 @@ def _evaluate(arguments: list[str]) -> None:
     from softgm_bench.runs.machine import keep_memory, set_threads
 
     trained = policy.load(source, options.device, overrides)
+    options.check_fits(trained)
     unusual = {"horizon": options.horizon, "sampled": not options.deterministic}
+    if options.intervention != "none":
+        unusual["intervention"] = options.intervention
     folder = Path(options.out or evaluation_folder.default_folder(source, trained, overrides, options.seed, unusual))
     evaluation_folder.check(folder, options.overwrite)
     set_threads(options.threads)
@@ -82,7 +88,8 @@ def _evaluate(arguments: list[str]) -> None:
     seconds = time.perf_counter() - began
     summary = evaluation_folder.describe(trained, records, options.describe(trained, overrides))
     under = trained.config.perturbation.name
-    title = f"{trained.label} on {summary['task']}, perturbation {under}, seed {options.seed}:"
+    shown = f", intervention {options.intervention}" if options.intervention != "none" else ""
+    title = f"{trained.label} on {summary['task']}, perturbation {under}{shown}, seed {options.seed}:"
     print(table(summary["metrics"], title), flush=True)  # before anything is written: a full disk leaves it
     try:
         evaluation_folder.write(folder, records, summary)

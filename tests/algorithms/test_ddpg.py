@@ -148,7 +148,7 @@ def test_an_update_moves_actor_critic_and_target_on_every_model(build, name, mod
         assert sum(moved) > 0.9 * len(moved)
     assert set(metrics) == {
         *("loss_actor", "loss_value", "q_mean", "target_mean", "actor_grad_norm", "critic_grad_norm"),
-        *("gradient_steps", "replay_size"),
+        *("gradient_steps", "replay_size", "actor_saturation", "actor_preactivation"),
     }
     assert all(torch.tensor(value).isfinite() for value in metrics.values())
     # the collector's policy is the loss's actor

@@ -148,7 +148,7 @@ def test_an_update_moves_actor_and_critic_and_reports_what_it_did(build, name):
     metrics = algorithm.update(batch)
     after = [*algorithm._actor_parameters, *algorithm._critic_parameters]
     assert sum(not torch.equal(a, b) for a, b in zip(before, after, strict=True)) > 0.8 * len(before)
-    expected = {"loss_objective", "loss_critic", "loss_entropy", "entropy", "kl_approx", "clip_fraction"}
+    expected = {"loss_objective", "loss_critic", "entropy", "kl_approx", "clip_fraction", "actor_saturation"}
     assert expected <= set(metrics)
     assert all(torch.tensor(value).isfinite() for value in metrics.values())
 

@@ -154,6 +154,7 @@ def test_an_update_moves_actor_critics_targets_and_temperature_on_every_model(bu
     assert set(metrics) == {
         *("loss_actor", "loss_qvalue", "loss_alpha", "alpha", "entropy", "q_mean"),
         *("actor_grad_norm", "critic_grad_norm", "alpha_grad_norm", "gradient_steps", "replay_size"),
+        *("actor_saturation", "actor_preactivation"),
     }
     assert all(torch.tensor(value).isfinite() for value in metrics.values())
     assert {p.data_ptr() for p in algorithm.policy.parameters()} == {

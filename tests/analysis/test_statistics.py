@@ -137,3 +137,13 @@ def test_the_bootstrap_repeats_for_a_seed_and_changes_with_it():
     first, again, other = (Bootstrap(500, seed).interval("", statistics.iqm, values) for seed in (0, 0, 1))
     np.testing.assert_array_equal(first, again)
     assert (first != other).any()
+
+
+@pytest.mark.parametrize(
+    ("lost", "won", "p"), [(0, 0, 1.0), (5, 5, 1.0), (1, 0, 1.0), (6, 0, 2 / 2**6), (1, 8, 20 / 2**9)]
+)
+def test_mcnemars_exact_p_is_the_binomials_two_tails(lost, won, p):
+    """Worked by hand: 2 (C(9, 0) + C(9, 1)) / 2^9 for one against eight."""
+    first = np.array([1.0] * lost + [0.0] * won + [1.0, 0.0, 1.0])
+    second = np.array([0.0] * lost + [1.0] * won + [1.0, 0.0, 1.0])
+    assert statistics.mcnemar(first, second) == (lost, won, pytest.approx(p))

@@ -58,6 +58,13 @@ def test_only_the_tuned_recipe_has_what_walls_need_and_only_on_walls():
 
 @pytest.mark.parametrize("recipe", ["paper", "tuned"])
 @pytest.mark.parametrize("algo", algorithm_configs())
+def test_no_independent_critic_is_told_what_is_hidden(algo, recipe):
+    critic = compose([f"algo={algo}", f"recipe={recipe}", "task=wall"]).algo.critic
+    assert critic.asymmetric is (recipe == "tuned" and algo in ("softgm", "mappo", "maddpg", "masac"))
+
+
+@pytest.mark.parametrize("recipe", ["paper", "tuned"])
+@pytest.mark.parametrize("algo", algorithm_configs())
 def test_a_smoke_run_is_small_and_takes_gradient_steps_whatever_the_recipe(algo, recipe):
     config = compose([f"algo={algo}", f"recipe={recipe}", "experiment=smoke"])
     frames = config.experiment.num_envs * config.experiment.steps_per_batch

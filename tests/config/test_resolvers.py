@@ -30,6 +30,11 @@ def test_a_value_depends_on_whether_the_algorithm_has_a_replay():
     assert resolved("${on_or_off_policy:1, 2}", algo={"name": "mine", "replay_capacity": 5}) == 2
 
 
+def test_a_value_depends_on_whether_the_critic_is_centralised():
+    assert resolved("${if_centralised:1, 2}", algo={"name": "mine", "centralised": True}) == 1
+    assert resolved("${if_centralised:1, 2}", algo={"name": "mine", "centralised": False}) == 2
+
+
 def test_a_value_depends_on_whether_the_experiment_is_a_smoke_run():
     assert resolved("${in_smoke:1, 2}", experiment={"name": "smoke"}) == 1
     assert resolved("${in_smoke:1, 2}", experiment={"total_frames": 7}) == 2

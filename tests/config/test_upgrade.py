@@ -44,11 +44,11 @@ def test_every_committed_policy_is_loaded(path):
 
 def before(*overrides):
     """Settings as they were written before recipes and experiments had names."""
-    values = plain(compose(list(overrides)))
+    values = OmegaConf.create(plain(compose(list(overrides))))
     for key in NEUTRAL:
         group, _, name = key.rpartition(".")
-        del (values[group] if group else values)[name]
-    return values
+        del (OmegaConf.select(values, group) if group else values)[name]
+    return OmegaConf.to_container(values)
 
 
 def test_keys_that_there_were_not_have_values_that_change_nothing():
@@ -57,12 +57,13 @@ def test_keys_that_there_were_not_have_values_that_change_nothing():
     assert (config.task.train_horizon, config.task.hidden_scene) == (None, False)
     assert config.experiment.train_horizon == 200
     assert config.task.curriculum.enabled is config.algo.critic.asymmetric is True
+    assert config.algo.actor.embedding_norm is config.algo.critic.embedding_norm is False
 
 
 @pytest.mark.parametrize("name", ["softgm_no_stage1", "softgm_no_stage2"])
 def test_an_ablation_that_was_an_algorithm_is_a_model_with_the_same_label(name):
-    today = compose(["task=wall", f"model={name}"])
-    values = before("task=wall", f"model={name}")
+    today = compose(["recipe=paper", "task=wall", f"model={name}"])
+    values = before("recipe=paper", "task=wall", f"model={name}")
     values["algo"]["name"], values["model"]["name"] = name, "softgm"
 
     config = typed(OmegaConf.create(values))

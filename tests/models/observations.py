@@ -66,12 +66,14 @@ def actor_config(**changes):
         "state_dependent_sigma": False,
         "mean_bound": 3.0,
         "persistence": 0.0,
+        "embedding_norm": False,
+        "relative_points": False,
     }
     return ActorConfig(**(values | changes))
 
 
 def value_config(**changes):
-    values = {"widths": [8], "pooling": "mean", "mlp": None, "asymmetric": False}
+    values = {"widths": [8], "pooling": "mean", "mlp": None, "asymmetric": False, "embedding_norm": False}
     return ValueConfig(**(values | changes))
 
 

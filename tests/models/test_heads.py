@@ -1,3 +1,6 @@
+import itertools
+from dataclasses import replace
+
 import pytest
 import torch
 from observations import SIZES, actor_config, observation, randomise, softgm_config, value_config
@@ -5,8 +8,9 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from softgm_bench.envs import entries
 from softgm_bench.models import MLPConfig, MLPEncoder, build_actor, build_value, graph
-from softgm_bench.models.heads import LOC, POOLINGS, SCALE, STATE_VALUE
+from softgm_bench.models.heads import LOC, POOLINGS, SATURATION_FRAMES, SCALE, STATE_VALUE, actor_saturation
 from softgm_bench.models.mlp import MLPTeamEncoder
+from softgm_bench.models.registry import Normalised, NormalisedTeam
 
 ENCODERS = pytest.mark.parametrize(
     "encoder", [softgm_config(), MLPConfig(hidden=8, layers=2, velocity_scale=1.0)], ids=["softgm", "mlp"]
@@ -186,6 +190,30 @@ def test_privileged_channels_enter_the_heads_that_are_built_for_them_and_no_othe
             assert same(value, STATE_VALUE) is not bool(known)
 
 
+def test_an_oracles_actor_is_told_a_point_as_it_is_told_the_target():
+    """Were the opening's centre the target, both would be told every agent alike."""
+    sizes = replace(SIZES, n_privileged=4, n_points=1)
+    torch.manual_seed(0)
+    policy = build_actor(softgm_config(), sizes, actor_config(relative_points=True), sizes.n_privileged)
+    td = observation((5,))
+    td[entries.PRIVILEGED] = torch.cat([td[entries.TARGET], torch.full((5, 1), 0.3)], dim=-1)
+    inputs = policy.module[0].head.inputs(td)
+    known, relative = inputs[..., -7:-3], inputs[..., -3:]
+    assert torch.equal(known, td[entries.PRIVILEGED].unsqueeze(-2).expand(5, 4, 4))
+    assert torch.equal(relative, graph.agent_channels(td)[..., 9:12])
+    absolute = build_actor(softgm_config(), sizes, actor_config(), sizes.n_privileged).module[0].head
+    assert torch.equal(absolute.inputs(td)[..., -4:], known)
+    assert absolute.function[0].in_features == inputs.shape[-1] - 3
+
+
+def test_only_an_oracles_actor_is_told_points():
+    sizes = replace(SIZES, n_privileged=4, n_points=1)
+    for relative in (False, True):
+        policy = build_actor(softgm_config(), sizes, actor_config(relative_points=relative))
+        assert set(policy.in_keys) == set(entries.OBSERVATION)
+        assert policy.module[0].head.function[0].in_features == graph.CHANNELS + 8
+
+
 def test_an_unknown_pooling_is_refused():
     with pytest.raises(ValueError, match=r"algo\.critic\.pooling is max: choose one of mean, concat"):
         value_config(pooling="max")
@@ -204,3 +232,73 @@ def test_persistence_mixes_the_previous_action_into_the_mean():
     torch.testing.assert_close(persistent(data.clone())[LOC], 0.25 * loc + 0.75 * previous)
     with pytest.raises(ValueError, match=r"persistence is 1\.0"):
         actor(persistence=1.0)
+
+
+NORMALISED = pytest.mark.parametrize(
+    "build",
+    [
+        lambda encoder, norm: build_actor(encoder, SIZES, actor_config(embedding_norm=norm)),
+        lambda encoder, norm: build_value(encoder, SIZES, value_config(embedding_norm=norm)),
+        lambda encoder, norm: build_value(encoder, SIZES, value_config(embedding_norm=norm), centralised=False),
+        lambda encoder, norm: build_value(encoder, SIZES, value_config(embedding_norm=norm, pooling="concat")),
+    ],
+    ids=["actor", "mean", "independent", "concat"],
+)
+
+
+@ENCODERS
+@NORMALISED
+def test_a_normalised_embedding_gives_the_head_the_same_whatever_its_scale(encoder, build):
+    """Its mean is 0 and its variance 1, and what a hundred times the embedding would say is the same."""
+    torch.manual_seed(0)
+    network = build(encoder, True)
+    (normalised,) = (module for module in network.modules() if isinstance(module, Normalised | NormalisedTeam))
+    inputs = (observation((5,)), *([torch.zeros(5, 0)] if isinstance(normalised, NormalisedTeam) else []))
+    once = normalised(*inputs)
+    torch.testing.assert_close(once.mean(-1), torch.zeros(once.shape[:-1]), rtol=0.0, atol=1e-5)
+    torch.testing.assert_close(once.var(-1, correction=0), torch.ones(once.shape[:-1]), rtol=0.0, atol=1e-2)
+    embed = normalised.encoder.forward
+    normalised.encoder.forward = lambda *args: 100.0 * embed(*args)
+    torch.testing.assert_close(normalised(*inputs), once, rtol=0.0, atol=1e-2)
+
+
+@ENCODERS
+@NORMALISED
+def test_without_normalisation_a_network_has_the_parameters_and_the_draws_of_before(encoder, build):
+    torch.manual_seed(0)
+    plain = build(encoder, False).state_dict()
+    torch.manual_seed(0)
+    normalised = build(encoder, True).state_dict()
+    assert not any("norm" in name for name in plain)
+    drawn = [value for name, value in normalised.items() if not name.endswith("norm.weight")]
+    assert len(drawn) == len(normalised) - 1
+    assert all(torch.equal(one, other) for one, other in zip(plain.values(), drawn, strict=True))
+
+
+@ENCODERS
+def test_saturation_is_of_the_heads_first_layer(encoder):
+    policy, td = actor(encoder), observation((6, 4))
+    head = policy.module[0].head
+    size = head.function[0](head.inputs(td)).abs()
+    state = torch.get_rng_state()
+    told = actor_saturation(policy, td)
+    assert torch.equal(torch.get_rng_state(), state)
+    expected = {"actor_saturation": (size > 3.0).float().mean().item(), "actor_preactivation": size.mean().item()}
+    assert told == pytest.approx(expected, rel=1e-5)
+    with torch.no_grad():
+        head.function[0].bias.fill_(100.0)
+    assert actor_saturation(policy, td)["actor_saturation"] == 1.0
+    assert actor_saturation(actor(encoder, widths=[]), td) == {}
+
+
+def test_saturation_is_told_of_frames_all_over_a_large_batch():
+    policy, td = actor(), observation((100, 6))
+    seen = []
+    inputs = policy.module[0].head.inputs
+    policy.module[0].head.inputs = lambda frames: seen.append(frames) or inputs(frames)
+    actor_saturation(policy, td)
+    assert len(seen[0]) == SATURATION_FRAMES
+    flat = td.reshape(-1)[entries.TIP]
+    rows = [(flat == tip).all(-1).nonzero().item() for tip in seen[0][entries.TIP]]
+    assert rows[0] == 0
+    assert {after - before for before, after in itertools.pairwise(rows)} == {2, 3}

@@ -96,7 +96,7 @@ def built(algo, model, env, *overrides):
     """An algorithm whose parameters are all drawn at random, so that no term is hidden by a zero or a small gain."""
     sizes = () if algo in ON_POLICY else TINY_OFF_POLICY
     config = compose(["task=wall", f"algo={algo}", f"model={model}", *sizes, *overrides])
-    algorithm = build_algorithm(config.algo, config.model, env)
+    algorithm = build_algorithm(config.algo, config.model, env, config.oracle)
     torch.manual_seed(0)
     with torch.no_grad():
         for parameter in algorithm.policy.parameters():
@@ -140,6 +140,17 @@ def test_no_policy_reads_what_its_asymmetric_critic_is_told(algo, model, wall):
     other[entries.PRIVILEGED] += 1.0
     assert set(policy.in_keys) == set(entries.OBSERVATION)
     assert torch.equal(act(policy, td), act(policy, other))
+
+
+@pytest.mark.parametrize(("algo", "model"), [*product(ALGORITHMS, ("mlp",)), ("softgm", "softgm")])
+def test_an_oracles_policy_reads_the_opening_in_either_recipe(algo, model, wall):
+    for relative in ("true", "false"):
+        oracle = ("observation=oracle", f"algo.actor.relative_points={relative}")
+        policy, td = built(algo, model, wall, *oracle).policy, scene(wall)
+        other = td.clone()
+        other[entries.PRIVILEGED] += 1.0
+        assert set(policy.in_keys) == {*entries.OBSERVATION, entries.PRIVILEGED}
+        assert not torch.equal(act(policy, td), act(policy, other))
 
 
 @pytest.mark.parametrize("moved", [0, 3, 5])

@@ -89,3 +89,13 @@ def test_rows_are_on_disk_at_once_and_read_back_exactly(tmp_path):
         rows = list(csv.DictReader(file))
     assert [row["frames"] for row in rows] == ["10", "20"]
     assert math.isnan(float(rows[1]["loss"]))
+
+
+def test_a_file_of_an_earlier_version_keeps_its_columns(tmp_path):
+    path = tmp_path / "metrics.csv"
+    path.write_text("frames,loss\n10,0.5\n")
+    with CsvWriter(path, append=True) as writer:
+        writer.write({"frames": 20, "loss": 0.25, "measured_today": 1.0})
+        with pytest.raises(ValueError, match=r"columns changed: \['loss'\]"):
+            writer.write({"frames": 30})
+    assert path.read_text() == "frames,loss\n10,0.5\n20,0.25\n"

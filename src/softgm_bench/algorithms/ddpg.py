@@ -19,7 +19,7 @@ from softgm_bench.algorithms.registry import register_algorithm
 from softgm_bench.envs import entries
 from softgm_bench.envs.interface import Environment, Sizes
 from softgm_bench.models.action_value import ACTION_VALUE, build_action_value
-from softgm_bench.models.heads import AgentHead, input_keys
+from softgm_bench.models.heads import AgentHead, input_keys, told_points
 from softgm_bench.models.registry import Encoder, build_encoder
 
 
@@ -29,9 +29,13 @@ class DeterministicActorConfig:
 
     Attributes:
         widths: hidden layers, each followed by tanh.
+        embedding_norm: g_i is normalised before it enters the head (paper: no); see ``models.registry.Normalised``.
+        relative_points: an oracle's actor is told the privileged points relative to each agent too.
     """
 
     widths: list[int]
+    embedding_norm: bool
+    relative_points: bool
 
 
 @dataclass
@@ -49,11 +53,18 @@ class DDPGConfig(OffPolicyConfig):
 class DeterministicPolicy(TensorDictModuleBase):
     """Writes ``entries.ACTION`` = tanh(f([o_i || g_i])), ``(..., N, 2)``; parameters shared by all agents."""
 
-    def __init__(self, encoder: Encoder, actions: int, config: DeterministicActorConfig, n_privileged: int = 0) -> None:
+    def __init__(
+        self,
+        encoder: Encoder,
+        actions: int,
+        config: DeterministicActorConfig,
+        n_privileged: int = 0,
+        n_points: int = 0,
+    ) -> None:
         """Put the policy's head on an encoder; ``actions`` is A, the numbers in one agent's action."""
         super().__init__()
         self.in_keys, self.out_keys = input_keys(encoder, n_privileged), [entries.ACTION]
-        self.head = AgentHead(encoder, config.widths, actions, last_gain=0.01, n_privileged=n_privileged)
+        self.head = AgentHead(encoder, config.widths, actions, 0.01, n_privileged, n_points)
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write ``entries.ACTION``."""
@@ -104,7 +115,9 @@ class DDPG(OffPolicy):
     ) -> NoisyExplorer:
         """Build the actor alone; see ``algorithms.build_policy``."""
         known = sizes.n_privileged if oracle else 0
-        actor = DeterministicPolicy(build_encoder(model_config, sizes), sizes.action, config.actor, known)
+        encoder = build_encoder(model_config, sizes, config.actor.embedding_norm)
+        points = told_points(config.actor, sizes, known)
+        actor = DeterministicPolicy(encoder, sizes.action, config.actor, known, points)
         return NoisyExplorer(actor, sizes.action, config, frames)
 
     def __init__(self, config: DDPGConfig, model_config: Any, env: Environment, oracle: bool = False) -> None:

@@ -16,6 +16,7 @@ from softgm_bench.algorithms.vector_replay_buffer import VectorReplayBuffer
 from softgm_bench.envs import entries
 from softgm_bench.envs.interface import VECTOR, Environment
 from softgm_bench.models.action_value import ActionValueConfig
+from softgm_bench.models.heads import actor_saturation
 from softgm_bench.upstream import graphs
 from softgm_bench.upstream.soft_update import FusedSoftUpdate
 
@@ -183,8 +184,8 @@ class OffPolicy:
             batch: ``(num_envs, steps)`` consecutive frames.
 
         Returns:
-            Means over the gradient steps of losses and gradient norms, NaN if none was taken; how many were taken, and
-            how many transitions can be sampled.
+            Means over the gradient steps of losses and gradient norms, NaN if none was taken; how many were taken,
+            how many transitions can be sampled, and the saturation of the actor's head.
         """
         self.replay.add(batch)
         self.frames += batch.numel()
@@ -196,10 +197,8 @@ class OffPolicy:
             totals = metrics if totals is None else totals + metrics
         # the only look at results: a GPU works through all steps without being waited for
         values = [float("nan")] * len(self._names) if totals is None else (totals / steps).tolist()
-        return dict(zip(self._names, values, strict=True)) | {
-            "gradient_steps": float(steps),
-            "replay_size": float(len(self.replay)),
-        }
+        counts = {"gradient_steps": float(steps), "replay_size": float(len(self.replay))}
+        return dict(zip(self._names, values, strict=True)) | counts | actor_saturation(self.policy, batch)
 
     def sample(self) -> TensorDictBase:
         """Transitions as the loss reads them: the team's reward and end of episode given to every agent."""

@@ -18,7 +18,14 @@ from softgm_bench.algorithms.registry import register_algorithm
 from softgm_bench.algorithms.team import give_to_agents
 from softgm_bench.envs import entries
 from softgm_bench.envs.interface import Environment, Sizes
-from softgm_bench.models.heads import STATE_VALUE, ActorConfig, ValueConfig, build_actor, build_value
+from softgm_bench.models.heads import (
+    STATE_VALUE,
+    ActorConfig,
+    ValueConfig,
+    actor_saturation,
+    build_actor,
+    build_value,
+)
 from softgm_bench.upstream import graphs
 from softgm_bench.upstream.ppo_loss import LeanPPOLoss
 
@@ -164,7 +171,8 @@ class PPO:
 
         Returns:
             Means over all minibatches of losses, entropy, KL divergence, clip fraction and gradient norms; the learning
-            rates that the next update begins with. Without an entropy bonus, entropy is that of the frames' actions.
+            rates that the next update begins with; how saturated the actor's head is. Without an entropy bonus, entropy
+            is that of the frames' actions.
         """
         frames = self.prepare(batch)
         # results are first looked at here: a GPU works through all minibatches without being waited for
@@ -176,7 +184,8 @@ class PPO:
         means = {name: sum(epoch[name] for epoch in epochs) / len(epochs) for name in self._names}
         if not self.loss.entropy_bonus:
             means |= {"loss_entropy": 0.0, "entropy": -batch.get(entries.LOG_PROB).mean().item()}
-        return means | dict(zip(("actor_lr", "critic_lr"), self._learning_rates, strict=True))
+        rates = dict(zip(("actor_lr", "critic_lr"), self._learning_rates, strict=True))
+        return means | rates | actor_saturation(self.policy, batch)
 
     def prepare(self, batch: TensorDictBase) -> TensorDictBase:
         """Estimate advantages and value targets, and flatten to frames ``(num_envs * steps,)``.

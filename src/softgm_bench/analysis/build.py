@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Iterable, Sequence
 
-from softgm_bench.analysis import aggregate, figures, names, paper, tables
+from softgm_bench.analysis import aggregate, figures, interventions, names, paper, tables
 from softgm_bench.analysis.document import Block, Document, Section
 from softgm_bench.analysis.pools import Pools, by_algorithm, by_condition, newest, pool_evaluations, pool_runs
 from softgm_bench.analysis.runs import Found, Run
@@ -76,7 +76,12 @@ def _robustness(found: Found, pools: Pools, bootstrap: Bootstrap) -> list[Block 
     perturbed = pool_evaluations(found.evaluations)
     conditions = by_condition(pools, perturbed)
     evaluated = {subject: rows for subject, rows in conditions.items() if subject in {key[:2] for key in perturbed}}
-    return [tables.table_two(pools, conditions, bootstrap), figures.robustness(evaluated, bootstrap)]
+    pairs = interventions.pairs(found.evaluations)
+    return [
+        tables.table_two(pools, conditions, bootstrap),
+        figures.robustness(evaluated, bootstrap),
+        tables.interventions(pairs) if pairs else None,
+    ]
 
 
 def _curves(grouped: figures.RunsByKey) -> Block | None:

@@ -135,16 +135,17 @@ def _kinds(run: Run) -> set[str]:
 def pool_evaluations(evaluations: Sequence[Evaluation]) -> dict[tuple[str, str, str], Pool]:
     """Pool evaluations of the trained setting by task, algorithm and ``condition``.
 
-    Those with other settings than were trained with are left out. Of several with the same seed the one counts that is
-    deterministic, has the longest time limit, the most frames, the most episodes, in this order; all seeds of a pool
-    have the same time limit and kind of actions.
+    Those with other settings than were trained with, or under an intervention, are left out. Of several with the same
+    seed the one counts that is deterministic, has the longest time limit, the most frames, the most episodes, in this
+    order; all seeds of a pool have the same time limit and kind of actions.
     """
     groups: dict[tuple[str, str, str], dict[int, Evaluation]] = {}
     protocols: dict[tuple[str, str, str], tuple] = {}
     for evaluation in sorted(evaluations, key=_preference):
         key = (evaluation.task, evaluation.label, condition(evaluation))
         protocol = (evaluation.deterministic, evaluation.horizon)
-        if not evaluation.overrides and protocols.setdefault(key, protocol) == protocol:
+        usual = not evaluation.overrides and evaluation.intervention == "none"
+        if usual and protocols.setdefault(key, protocol) == protocol:
             groups.setdefault(key, {}).setdefault(evaluation.seed, evaluation)
     return {key: Pool(tuple(by_seed[seed] for seed in sorted(by_seed))) for key, by_seed in sorted(groups.items())}
 

@@ -41,6 +41,8 @@ class Evaluation:
         horizon: most control steps of an episode; None if neither settings nor episodes say it.
         perturbation: its name and parameters; ``{"name": "none"}`` without.
         overrides: settings other than those that were trained with, the perturbation apart.
+        intervention: what the policy was shown in place of what its agents saw; ``none``.
+        scenes: what decides which scene each episode has: evaluations that agree in it can be compared by episodes.
     """
 
     folder: str
@@ -53,6 +55,8 @@ class Evaluation:
     horizon: int | None
     perturbation: Mapping[str, Any]
     overrides: Sequence[str]
+    intervention: str
+    scenes: Mapping[str, Any]
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,6 +160,7 @@ def _source(folder: RunFolder, name: str) -> Run | Evaluation:
     _compare(episodes, summary["final_evaluation" if trained else "metrics"])
     config: Any = OmegaConf.to_container(OmegaConf.load(folder.config)) if trained else None
     perturbation = summary.get("perturbation", "none")
+    horizon = _final_horizon(config) if trained else summary.get("horizon") or _longest_failure(episodes)
     evaluation = Evaluation(
         folder=name,
         task=summary["task"],
@@ -164,9 +169,17 @@ def _source(folder: RunFolder, name: str) -> Run | Evaluation:
         frames=summary["frames"],
         episodes=episodes,
         deterministic=summary["deterministic"],
-        horizon=_final_horizon(config) if trained else summary.get("horizon") or _longest_failure(episodes),
+        horizon=horizon,
         perturbation={"name": perturbation} if isinstance(perturbation, str) else perturbation,
         overrides=tuple(one for one in summary.get("overrides", ()) if not one.startswith("perturbation")),
+        intervention=summary.get("intervention", "none"),
+        scenes={
+            "seed": summary.get("evaluation_seed"),
+            "episodes": len(episodes["length"]),
+            "horizon": horizon,
+            "batch": summary.get("batch"),
+            "device": summary.get("device", "cpu"),  # generators of others draw other numbers
+        },
     )
     return Run(evaluation, summary, config, _progress(folder)) if trained else evaluation
 

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import binomtest
 
 Array = NDArray[np.float64]
 Scores = Sequence[Array]
@@ -43,6 +44,26 @@ def probability_of_improvement(ours: Scores, theirs: Scores) -> Array:
     """
     differences = [x[..., :, None] - y[..., None, :] for x, y in zip(ours, theirs, strict=True)]
     return np.mean([((of_task > 0) + 0.5 * (of_task == 0)).mean(axis=(-2, -1)) for of_task in differences], axis=0)
+
+
+class Discordance(NamedTuple):
+    """Episodes in which one of two conditions succeeds and the other does not.
+
+    Attributes:
+        lost: the first succeeds, the second fails.
+        won: the first fails, the second succeeds.
+        p: McNemar's exact two-sided p-value: how likely a split at least as uneven is if either is as likely.
+    """
+
+    lost: int
+    won: int
+    p: float
+
+
+def mcnemar(first: Array, second: Array) -> Discordance:
+    """Compare success (0 or 1) of the same episodes under two conditions, ``(episodes,)`` each (McNemar 1947)."""
+    lost, won = int(((first == 1) & (second == 0)).sum()), int(((first == 0) & (second == 1)).sum())
+    return Discordance(lost, won, float(binomtest(lost, lost + won).pvalue) if lost + won else 1.0)
 
 
 class Bootstrap(NamedTuple):

@@ -7,6 +7,7 @@ from scipy.stats import rankdata
 from softgm_bench.analysis import names, paper
 from softgm_bench.analysis.aggregate import Aggregate, Comparison, Estimate
 from softgm_bench.analysis.document import Cell, Column, Table
+from softgm_bench.analysis.interventions import Pair
 from softgm_bench.analysis.pools import MARKS, Conditions, Pool, Pools, condition, wilson
 from softgm_bench.analysis.runs import Evaluation, Problem, Run
 from softgm_bench.analysis.statistics import Bootstrap
@@ -142,7 +143,11 @@ def _difference(pool: Pool | None, full: Pool | None) -> Cell | str:
     """In percentage points."""
     if pool is None or full is None or pool.success_rates is None or full.success_rates is None:
         return NOT_RUN
-    return f"{100 * (pool.success_rates.mean() - full.success_rates.mean()):+.1f}".replace("-", "−")
+    return _points(pool.success_rates.mean() - full.success_rates.mean())
+
+
+def _points(difference: float) -> str:
+    return f"{100 * difference:+.1f}".replace("-", "−")
 
 
 def _name(label: str, pool: Pool | None) -> str:
@@ -225,6 +230,37 @@ def comparisons(pairs: Sequence[Comparison]) -> Table:
     return _table("improvement", caption, [*_texts("Algorithm", "against", "tasks"), *results], rows)
 
 
+def interventions(pairs: Sequence[Pair]) -> Table:
+    """Show what each intervention costs a policy, on the same scenes."""
+    success = _numbers("without", "with", "difference, points", group="Success, %")
+    discordant = _numbers("only without", "only with", "exact p", group="Episodes that succeed")
+    columns = [*_texts("Task", "Algorithm", "Condition", "Intervention"), *_numbers("seed", "episodes")]
+    columns += [*success, *discordant, *_texts("not compared, because")]
+    rows = [_intervention(pair) for pair in pairs]
+    caption = (
+        "Interventions: what a policy is shown is changed, the world and its scenes are not. Each row compares one "
+        "policy's episodes with those it had without, one by one. "
+    )
+    caption += _protocol([Pool((pair.intervened,)) for pair in pairs])
+    notes = [
+        "exact p: McNemar's test, two-sided, of the episodes in which only one of the two succeeds. It holds nothing "
+        "about seeds, and rows are not corrected for their number."
+    ]
+    return _table("interventions", caption, columns, rows, notes)
+
+
+def _intervention(pair: Pair) -> Row:
+    one, plain, found = pair.intervened, pair.plain, pair.discordance
+    subject: Row = [names.task(one.task), names.algorithm(one.label), names.perturbation(condition(one))]
+    subject += [one.intervention.replace("_", " "), str(one.seed), str(len(one.episodes["length"]))]
+    if plain is None or found is None:
+        return [*subject, *[DASH] * 6, Cell(pair.reason, muted=True)]
+    rates = [one_of.episodes["success"].mean() for one_of in (plain, one)]
+    difference = _points(rates[1] - rates[0])
+    tested: Row = [str(found.lost), str(found.won), f"{found.p:.2g}"]
+    return [*subject, *map(names.percent, rates), difference, *tested, ""]
+
+
 SOURCE = [*_texts("Task", "Algorithm"), *_numbers("seed")]
 RESULT = [
     *_numbers("episodes"),
@@ -250,7 +286,8 @@ def evaluation_sources(evaluations: Sequence[Evaluation]) -> Table:
     columns = [*SOURCE, *_texts("Condition", "other settings"), *RESULT, *_texts("source")]
     rows: list[Row] = []
     for one in evaluations:
-        settings = [names.perturbation(condition(one)), " ".join(one.overrides)]
+        shown = [f"intervention={one.intervention}"] if one.intervention != "none" else []
+        settings = [names.perturbation(condition(one)), " ".join([*one.overrides, *shown])]
         rows.append([*_source(one), *settings, *_result(one), Cell(one.folder, muted=True)])
     caption = "Every evaluation beside training, with Wilson's 95 % interval over its episodes."
     return _table("evaluations", caption, columns, rows)

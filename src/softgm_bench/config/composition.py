@@ -149,8 +149,8 @@ def _fill(schema: DictConfig) -> None:
     """Give keys that runs of before do not have, nor perhaps tasks of others, the values that change nothing."""
     for key, value in NEUTRAL.items():
         group, _, name = key.rpartition(".")
-        node = schema[group] if group else schema
-        if name in list(node):
+        node = OmegaConf.select(schema, group) if group else schema
+        if node is not None and name in list(node):
             node[name] = value
 
 

@@ -24,6 +24,11 @@ def on_or_off_policy(on: Any, off: Any, *, _root_: DictConfig) -> Any:
     return _node(on if OmegaConf.select(_root_, "algo.replay_capacity") is None else off)
 
 
+def if_centralised(centralised: Any, independent: Any, *, _root_: DictConfig) -> Any:
+    """The first value for algorithms with a centralised critic (``algo.centralised``), the second for the others."""
+    return _node(centralised if OmegaConf.select(_root_, "algo.centralised") else independent)
+
+
 def in_smoke(smoke: Any, otherwise: Any, *, _root_: DictConfig) -> Any:
     """The first value with ``experiment=smoke``, the second with every other experiment."""
     return _node(smoke if OmegaConf.select(_root_, "experiment.name") == SMOKE else otherwise)
@@ -51,5 +56,5 @@ def _node(value: Any) -> Any:
 
 def register() -> None:
     """Let YAML call the functions above by their names."""
-    for resolver in (tuned_or_paper, on_or_off_policy, in_smoke, in_gpu, first, label):
+    for resolver in (tuned_or_paper, on_or_off_policy, if_centralised, in_smoke, in_gpu, first, label):
         OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)

@@ -14,6 +14,9 @@ NEUTRAL: dict[str, Any] = {
     "experiment.minutes": None,
     "task.train_horizon": None,
     "task.hidden_scene": False,
+    "algo.actor.embedding_norm": False,
+    "algo.critic.embedding_norm": False,
+    "algo.actor.relative_points": False,
 }
 ABLATIONS = ("softgm_no_stage1", "softgm_no_stage2")  # algorithms then, models of the algorithm softgm now
 

@@ -25,6 +25,7 @@ class Sizes:
         n_slots: obstacle slots of a graph observation, M; 0 without obstacles.
         n_features: length of an agent's observation where it is a plain vector, F; 0 for a graph observation.
         n_privileged: numbers that the task knows of a scene beyond the observation, P.
+        n_points: points among them, m; the first ``3 n_points`` numbers are their coordinates.
     """
 
     n_agents: int
@@ -32,6 +33,7 @@ class Sizes:
     n_slots: int = 0
     n_features: int = 0
     n_privileged: int = 0
+    n_points: int = 0
 
     @property
     def layout(self) -> str:

@@ -26,7 +26,9 @@ from softgm_bench.upstream import graphs
 def sizes_of(task: Task) -> Sizes:
     """Give the sizes of a task's actions and observations."""
     n_slots = task.config.slots if task.max_cylinders else 0
-    return Sizes(task.config.n_agents, DIRECTIONS, n_slots=n_slots, n_privileged=task.n_privileged)
+    return Sizes(
+        task.config.n_agents, DIRECTIONS, n_slots=n_slots, n_privileged=task.n_privileged, n_points=task.n_points
+    )
 
 
 class SoftArmEnv(EnvBase):

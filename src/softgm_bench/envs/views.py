@@ -26,6 +26,12 @@ def agent_channels(td: TensorDictBase, velocity_scale: float = 1.0) -> Tensor:
     return torch.cat([position, velocity, tangential, action, target - position, tip - position], dim=-1)
 
 
+def relative_points(td: TensorDictBase, n_points: int) -> Tensor:
+    """Give the privileged points from where each agent is, as it is given the target: ``(..., N, 3 n_points)``."""
+    points = td[entries.PRIVILEGED][..., : 3 * n_points].unflatten(-1, (n_points, 3))
+    return (points.unsqueeze(-3) - td[entries.AGENT_POSITION].unsqueeze(-2)).flatten(-2)
+
+
 def slot_channels(td: TensorDictBase) -> Tensor:
     """Give the slots' features without the reserved zeros, ``(..., M, 15)``; an inactive slot (PAD) is exactly zero.
 

@@ -59,10 +59,21 @@ class EpisodeRecords(Mapping[str, Values]):
         ]
 
 
+Show = Callable[[TensorDictBase], TensorDictBase]
+
+
 def evaluate(
-    policy: TensorDictModuleBase, env: EnvBase, *, deterministic: bool, seed: int, gamma: float = DISCOUNT
+    policy: TensorDictModuleBase,
+    env: EnvBase,
+    *,
+    deterministic: bool,
+    seed: int,
+    gamma: float = DISCOUNT,
+    show: Show | None = None,
 ) -> EpisodeRecords:
     """One episode in each of ``env``'s environments; the same seed gives the same episodes.
+
+    ``show`` makes of a frame ``(episodes,)`` the one that the policy is shown in its place.
 
     Training is not disturbed: ``env`` must not be the training environment, and the global generator, on which a
     policy that samples draws, is put back.
@@ -72,7 +83,7 @@ def evaluate(
     with torch.random.fork_rng(devices), torch.no_grad(), set_exploration_type(exploration):
         env.set_seed(seed)
         torch.manual_seed(seed)
-        return _first_episodes(policy, env, gamma)
+        return _first_episodes(policy, env, gamma, show)
 
 
 def evaluate_in_parts(
@@ -84,6 +95,7 @@ def evaluate_in_parts(
     seed: int,
     gamma: float = DISCOUNT,
     at_once: int | None = None,
+    show: Show | None = None,
 ) -> EpisodeRecords:
     """``episodes`` episodes; with the same ``at_once``, the same seed gives the same ones.
 
@@ -95,13 +107,14 @@ def evaluate_in_parts(
         seed: from which all seeds are derived; see ``evaluation_seed``.
         gamma: of the discounted return.
         at_once: environments simulated side by side, to save memory; None: all.
+        show: as ``evaluate`` takes it.
     """
     size = at_once or episodes
     parts = []
     for part, first in enumerate(range(0, episodes, size)):
         own = evaluation_seed(seed, part)
         env = build(min(size, episodes - first), own)
-        parts.append(evaluate(policy, env, deterministic=deterministic, seed=own, gamma=gamma))
+        parts.append(evaluate(policy, env, deterministic=deterministic, seed=own, gamma=gamma, show=show))
     return EpisodeRecords({name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
 
 
@@ -110,7 +123,7 @@ def evaluation_seed(seed: int, part: int = 0) -> int:
     return int(np.random.SeedSequence(seed, spawn_key=(2, part)).generate_state(1)[0])
 
 
-def _first_episodes(policy: TensorDictModuleBase, env: EnvBase, gamma: float) -> EpisodeRecords:
+def _first_episodes(policy: TensorDictModuleBase, env: EnvBase, gamma: float, show: Show | None) -> EpisodeRecords:
     data = env.reset()
     alive = torch.ones(env.batch_size, dtype=torch.bool, device=env.device)
     tally: _Tally | None = None
@@ -118,7 +131,7 @@ def _first_episodes(policy: TensorDictModuleBase, env: EnvBase, gamma: float) ->
     for step in itertools.count():
         if (free or step % CHECK_EVERY == 0) and not alive.any():
             break
-        data = env.step(act(policy, data, alive))
+        data = env.step(act(policy, data if show is None else show(data), alive))
         after = data["next"]
         tally = tally or _Tally(after, gamma)
         tally.add(after, alive)

@@ -24,6 +24,8 @@ class Protocol:
         horizon: control steps of an episode; None: the task's own.
         gamma: of the discounted return.
         batch: environments at once, to save memory; None: all. Others play other episodes.
+        intervention: what the policy is shown in place of what its agents see, on the same scenes; see
+            ``episodes.interventions``.
     """
 
     episodes: int = 100
@@ -32,6 +34,7 @@ class Protocol:
     horizon: int | None = None
     gamma: float = 0.99
     batch: int | None = None
+    intervention: str = "none"
 
     def check(self) -> None:
         """Refuse values that make no sense.
@@ -47,11 +50,26 @@ class Protocol:
             raise UserError(f"seed={self.seed}: a seed is a whole number from 0 to 2**63 - 1")
         if not 0.0 <= self.gamma <= 1.0:
             raise UserError(f"gamma={self.gamma}: it must lie between 0 and 1")
+        if self.intervention != "none":
+            from softgm_bench.episodes import interventions
+
+            interventions.check(self.intervention, self.episodes, self.batch)
+
+    def check_fits(self, trained: TrainedPolicy) -> None:
+        """Refuse an intervention on what neither the policy nor its task has.
+
+        Raises:
+            UserError: saying what is missing.
+        """
+        from softgm_bench.episodes import interventions
+
+        interventions.check_fits(self.intervention, trained)
 
     def play(self, trained: TrainedPolicy) -> EpisodeRecords:
         """Play the episodes in the environment that belongs to the policy."""
         from softgm_bench.assembly import build_env
         from softgm_bench.episodes.evaluation import evaluate_in_parts
+        from softgm_bench.episodes.interventions import INTERVENTIONS
 
         return evaluate_in_parts(
             trained.policy,
@@ -61,6 +79,7 @@ class Protocol:
             seed=self.seed,
             gamma=self.gamma,
             at_once=self.batch,
+            show=INTERVENTIONS[self.intervention],
         )
 
     def describe(self, trained: TrainedPolicy, overrides: Sequence[str]) -> dict[str, Any]:
@@ -72,6 +91,8 @@ class Protocol:
             "deterministic": self.deterministic,
             "horizon": self.horizon or trained.config.task.horizon,
             "batch": self.batch,
+            "intervention": self.intervention,
+            "device": trained.config.device.partition(":")[0],
             "discount": self.gamma,
             "threads": torch.get_num_threads(),
             "overrides": list(overrides),

@@ -32,11 +32,13 @@ class ActionValueConfig:
         widths: hidden layers, each followed by tanh.
         mlp: the critic's encoder is this MLP, whatever the actor's; None: the same model as the actor's.
         asymmetric: the head reads ``entries.PRIVILEGED`` too. Only training has a critic; execution does not need it.
+        embedding_norm: the encoder's embedding is normalised (paper: no); see ``models.registry.Normalised``.
     """
 
     widths: list[int]
     mlp: MLPConfig | None
     asymmetric: bool
+    embedding_norm: bool
 
 
 class AgentActionValue(TensorDictModuleBase):
@@ -88,7 +90,8 @@ def build_action_value(
     With ``n_privileged`` above 0 it reads ``entries.PRIVILEGED`` too.
     """
     encoder_config = config.mlp or encoder_config
+    norm = config.embedding_norm
     if not centralised:
-        return AgentActionValue(build_encoder(encoder_config, sizes), sizes.action, config, n_privileged)
-    encoder = build_team_encoder(encoder_config, sizes, sizes.n_agents * sizes.action + n_privileged)
+        return AgentActionValue(build_encoder(encoder_config, sizes, norm), sizes.action, config, n_privileged)
+    encoder = build_team_encoder(encoder_config, sizes, sizes.n_agents * sizes.action + n_privileged, norm)
     return TeamActionValue(encoder, sizes.n_agents, config, n_privileged)

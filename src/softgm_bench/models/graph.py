@@ -19,6 +19,7 @@ from softgm_bench.envs.views import (
     flat_features,
     flat_observation,
     obstacle_channels,
+    relative_points,
     slot_channels,
 )
 
@@ -44,6 +45,7 @@ __all__ = [  # with the views, so that models name one module
     "node_types",
     "obstacle_channels",
     "pad_channels",
+    "relative_points",
     "sense",
     "slot_channels",
     "slot_features",

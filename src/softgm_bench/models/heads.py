@@ -23,6 +23,7 @@ from torch import Tensor, nn
 
 from softgm_bench.envs import entries
 from softgm_bench.envs.interface import Sizes
+from softgm_bench.models import graph
 from softgm_bench.models.activation import Tanh
 from softgm_bench.models.mlp import MLPConfig
 from softgm_bench.models.registry import Encoder, TeamEncoder, build_encoder, build_team_encoder
@@ -32,6 +33,8 @@ LOC = ("agents", "loc")  # (B, N, 2), before the bound
 SCALE = ("agents", "scale")  # (B, N, 2)
 STATE_VALUE = "state_value"  # (B, 1) of a centralised critic, (B, N, 1) of an independent one
 POOLINGS = ("mean", "concat")
+SATURATED = 3.0  # |x| beyond which tanh has 1 % of its slope left
+SATURATION_FRAMES = 256  # of a batch, of which an actor's saturation is told
 
 
 @dataclass
@@ -47,6 +50,8 @@ class ActorConfig:
         mean_bound: bound b of the pre-tanh mean, applied as b tanh(mu / b).
         persistence: share p of the previous action in the pre-tanh mean, ``p atanh(a_{t-1}) + (1 - p) mu`` (paper: 0).
             Above 0, exploration is correlated in time: it moves a slow arm where independent noise only shakes it.
+        embedding_norm: g_i is normalised before it enters the head (paper: no); see ``models.registry.Normalised``.
+        relative_points: an oracle's actor is told the privileged points relative to each agent too.
     """
 
     widths: list[int]
@@ -56,6 +61,8 @@ class ActorConfig:
     state_dependent_sigma: bool
     mean_bound: float
     persistence: float
+    embedding_norm: bool
+    relative_points: bool
 
     def __post_init__(self) -> None:
         """Refuse values that give no policy.
@@ -85,12 +92,14 @@ class ValueConfig:
             pools nothing.
         mlp: the critic's encoder is this MLP, whatever the actor's; None: the same model as the actor's.
         asymmetric: the head reads ``entries.PRIVILEGED`` too. Only training has a critic; execution does not need it.
+        embedding_norm: as the actor's, of the critic's own encoder.
     """
 
     widths: list[int]
     pooling: str
     mlp: MLPConfig | None
     asymmetric: bool
+    embedding_norm: bool
 
     def __post_init__(self) -> None:
         """Refuse values that give no critic.
@@ -130,37 +139,81 @@ def feedforward(in_features: int, widths: Sequence[int], out_features: int, last
 class AgentHead(nn.Module):
     """``f([o_i || g_i])`` for every agent with shared parameters; o_i is the agent's own node (15 channels).
 
-    With privileged channels w it is ``f([o_i || g_i || w])``.
+    With privileged channels w it is ``f([o_i || g_i || w])``; with points p_k among them, ``f([o_i || g_i || w ||
+    p_1 - p_i || ..])`` with p_i the agent's position, as o_i holds the target.
     """
 
     def __init__(
-        self, encoder: Encoder, widths: Sequence[int], out_features: int, last_gain: float, n_privileged: int = 0
+        self,
+        encoder: Encoder,
+        widths: Sequence[int],
+        out_features: int,
+        last_gain: float,
+        n_privileged: int = 0,
+        n_points: int = 0,
     ) -> None:
-        """Put f (hidden layers ``widths``, last layer scaled by ``last_gain``) on an encoder, which gives g_i."""
+        """Put f (hidden layers ``widths``, last layer scaled by ``last_gain``) on an encoder, which gives g_i.
+
+        Of the ``n_privileged`` channels ``n_points`` points are given relative to each agent too.
+        """
         super().__init__()
         self.encoder = encoder
-        self.n_privileged = n_privileged
-        in_features = encoder.own_features + encoder.out_features + n_privileged
+        self.n_privileged, self.n_points = n_privileged, n_points
+        in_features = encoder.own_features + encoder.out_features + n_privileged + 3 * n_points
         self.function = feedforward(in_features, widths, out_features, last_gain)
 
     def forward(self, td: TensorDictBase) -> Tensor:
         """``(..., N, out_features)``."""
+        return self.function(self.inputs(td))
+
+    def inputs(self, td: TensorDictBase) -> Tensor:
+        """What f reads, ``(..., N, in_features)``."""
         parts = [self.encoder.own(td), self.encoder(td)]
         if self.n_privileged:
             known = td.get(entries.PRIVILEGED).unsqueeze(-2)
             parts.append(known.expand(*parts[0].shape[:-1], self.n_privileged))
-        return self.function(torch.cat(parts, dim=-1))
+        if self.n_points:
+            parts.append(graph.relative_points(td, self.n_points))
+        return torch.cat(parts, dim=-1)
+
+
+@torch.no_grad()
+def actor_saturation(policy: nn.Module, batch: TensorDictBase) -> dict[str, float]:
+    """Tell how far the first tanh of an actor's head is driven, over evenly spaced frames of a batch.
+
+    Nothing is drawn, so no random stream moves.
+
+    Args:
+        policy: with an ``AgentHead`` somewhere in it.
+        batch: ``(num_envs, steps)`` frames that the policy can read.
+
+    Returns:
+        ``actor_saturation``, the share of units with a pre-activation beyond +- ``SATURATED``, and
+        ``actor_preactivation``, the mean of its absolute value. Empty for a head without hidden layers or none at all.
+    """
+    head = next((module for module in policy.modules() if isinstance(module, AgentHead)), None)
+    if head is None or len(head.function) == 1:
+        return {}
+    count = min(batch.numel(), SATURATION_FRAMES)
+    frames = torch.arange(count, device=batch.device) * batch.numel() // count
+    chosen = (frames // batch.shape[1], frames % batch.shape[1])
+    read = batch.select(*input_keys(head.encoder, head.n_privileged))[chosen]
+    size = head.function[0](head.inputs(read)).abs()
+    share, mean = torch.stack([(size > SATURATED).float().mean(), size.mean()]).tolist()
+    return {"actor_saturation": share, "actor_preactivation": mean}
 
 
 class GaussianPolicy(TensorDictModuleBase):
     """Writes the pre-tanh mean ``LOC`` and standard deviation ``SCALE`` of every agent's action, ``(..., N, 2)``."""
 
-    def __init__(self, encoder: Encoder, actions: int, config: ActorConfig, n_privileged: int = 0) -> None:
+    def __init__(
+        self, encoder: Encoder, actions: int, config: ActorConfig, n_privileged: int = 0, n_points: int = 0
+    ) -> None:
         """Put the policy's head on an encoder; ``actions`` is A, the numbers in one agent's action."""
         super().__init__()
         self.in_keys, self.out_keys = input_keys(encoder, n_privileged), [LOC, SCALE]
         outputs = 2 * actions if config.state_dependent_sigma else actions
-        self.head = AgentHead(encoder, config.widths, outputs, last_gain=0.01, n_privileged=n_privileged)
+        self.head = AgentHead(encoder, config.widths, outputs, 0.01, n_privileged, n_points)
         self.persistence = config.persistence
         self.low, self.range = math.log(config.min_sigma), math.log(config.max_sigma / config.min_sigma)
         fraction = torch.tensor((math.log(config.initial_sigma) - self.low) / self.range)
@@ -224,6 +277,11 @@ class AgentValue(TensorDictModuleBase):
         return td.set(STATE_VALUE, self.head(td))
 
 
+def told_points(config: Any, sizes: Sizes, n_privileged: int) -> int:
+    """Number of points that an actor of these settings is told relative to each agent; only an oracle's is any."""
+    return sizes.n_points if n_privileged and config.relative_points else 0
+
+
 def build_actor(
     encoder_config: Any, sizes: Sizes, config: ActorConfig, n_privileged: int = 0
 ) -> ProbabilisticTensorDictSequential:
@@ -236,7 +294,8 @@ def build_actor(
     that of the stored float32 action by 2 % at |z| = 6 and without limit beyond, so that PPO's ratio of an unchanged
     policy would not be one. Losses that need the exact pathwise sample (SAC) take it from ``get_dist``.
     """
-    policy = GaussianPolicy(build_encoder(encoder_config, sizes), sizes.action, config, n_privileged)
+    encoder = build_encoder(encoder_config, sizes, config.embedding_norm)
+    policy = GaussianPolicy(encoder, sizes.action, config, n_privileged, told_points(config, sizes, n_privileged))
     sample = ProbabilisticTensorDictModule(
         in_keys={"loc": LOC, "scale": SCALE},
         out_keys=[entries.ACTION],
@@ -262,7 +321,8 @@ def build_value(
     that agent's actor reads. With ``n_privileged`` above 0 its head reads ``entries.PRIVILEGED`` too.
     """
     encoder_config = config.mlp or encoder_config
+    norm = config.embedding_norm
     if centralised and config.pooling == "concat":
-        return TeamValue(build_team_encoder(encoder_config, sizes, n_privileged), config, n_privileged)
-    encoder = build_encoder(encoder_config, sizes)
+        return TeamValue(build_team_encoder(encoder_config, sizes, n_privileged, norm), config, n_privileged)
+    encoder = build_encoder(encoder_config, sizes, norm)
     return (TeamValue if centralised else AgentValue)(encoder, config, n_privileged)

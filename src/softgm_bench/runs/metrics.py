@@ -15,24 +15,35 @@ Row = Mapping[str, float | int]
 
 
 class CsvWriter:
-    """Appends rows to a CSV file, each written out before the next begins. The first row names the columns."""
+    """Appends rows to a CSV file, each written out before the next begins. The first row names the columns.
+
+    A file that is appended to keeps its columns: what an earlier version did not measure is left out.
+    """
 
     def __init__(self, path: Path, append: bool = False) -> None:
         """Create the file, or empty it; with ``append``, append to the rows that it holds."""
         self._file = path.open("a+" if append else "w", newline="")
         self._writer: csv.DictWriter | None = None
+        self._append = append
         if append:
             self._file.seek(0)  # writing is at the end, wherever reading is
             names = next(csv.reader(self._file), None)
             self._writer = None if names is None else csv.DictWriter(self._file, names, lineterminator="\n")
 
     def write(self, row: Row) -> None:
-        """Append a row; it must have the columns of the first."""
+        """Append a row.
+
+        Raises:
+            ValueError: it lacks a column of the first, or has one that the first has not.
+        """
         if self._writer is None:
             self._writer = csv.DictWriter(self._file, list(row), lineterminator="\n")
             self._writer.writeheader()
-        if row.keys() != set(self._writer.fieldnames):
-            raise ValueError(f"columns changed: {sorted(row.keys() ^ set(self._writer.fieldnames))}")
+        columns = set(self._writer.fieldnames)
+        if self._append:
+            row = {name: value for name, value in row.items() if name in columns}
+        if row.keys() != columns:
+            raise ValueError(f"columns changed: {sorted(row.keys() ^ columns)}")
         self._writer.writerow(row)
         self._file.flush()
 

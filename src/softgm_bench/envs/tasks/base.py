@@ -136,12 +136,14 @@ class Task(ABC):
         max_cylinders: the number that scenes are padded to.
         max_cylinder_length: the longest cylinder of any scene, m; 0 where there is none.
         n_privileged: numbers in a scene's ``privileged``.
+        n_points: points among them, m; the first ``3 n_points`` numbers are their coordinates.
     """
 
     config_class: ClassVar[type[TaskConfig]]
     max_cylinders: int = 0
     max_cylinder_length: float = 0.0
     n_privileged: int = 0
+    n_points: int = 0
 
     def __init__(self, config: Any) -> None:
         """Keep the configuration."""

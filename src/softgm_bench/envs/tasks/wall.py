@@ -60,6 +60,7 @@ class Wall(Task):
 
     config_class = WallConfig
     n_privileged = 4
+    n_points = 1
 
     def __init__(self, config: WallConfig) -> None:
         """Lay out the columns.
