@@ -29,8 +29,8 @@ PARTS = ("rod", "sensing", "reward and observation", "resets", "framework")
 def watched(env: SoftArmEnv) -> Stopwatch:
     stopwatch = Stopwatch()
     stopwatch.watch(env.backend, "control_step", "rod")
-    for name in ("_look", "_count_contacts"):
-        stopwatch.watch(env, name, "sensing")
+    for name in ("sense", "contacts"):
+        stopwatch.watch(env.simulator, name, "sensing")
     stopwatch.watch(env, "_step", "reward and observation")
     stopwatch.watch(env, "maybe_reset", "resets")
     stopwatch.watch(env, "step_and_maybe_reset", "framework")
