@@ -29,7 +29,7 @@ PARTS = ("rod", "sensing", "reward and observation", "resets", "framework")
 def watched(env: SoftArmEnv) -> Stopwatch:
     stopwatch = Stopwatch()
     stopwatch.watch(env.backend, "control_step", "rod")
-    for name in ("sense", "count_contacts"):
+    for name in ("sense", "contacts"):
         stopwatch.watch(env.simulator, name, "sensing")
     stopwatch.watch(env, "_step", "reward and observation")
     stopwatch.watch(env, "maybe_reset", "resets")

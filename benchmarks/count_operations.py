@@ -27,7 +27,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from softgm_bench.assembly import build_algorithm, build_env
 from softgm_bench.config import Config, compose
-from softgm_bench.envs import SoftArmEnv, cuda_sensing, simulation, soft_arm
+from softgm_bench.envs import SoftArmEnv, cuda_sensing, cuda_verdict, simulation
 from softgm_bench.models import gat
 from softgm_bench.rod import cuda_backend, cuda_checks, sync
 from softgm_bench.rod.cuda_kernel import SIMULATED
@@ -36,7 +36,7 @@ TASKS = ("basic", "wall")
 SETTINGS = ("algo=softgm", "recipe=tuned", "backend=cuda", "dtype=float32", "rod.substeps=1", "threads=1")
 NUM_ENVS = 4
 ALLOCATIONS = ("empty", "empty_like", "empty_strided", "new_empty", "new_empty_strided", "_unsafe_view")
-KERNELS = (cuda_backend, cuda_checks, cuda_sensing)  # modules that launch kernels of ours
+KERNELS = (cuda_backend, cuda_checks, cuda_sensing, cuda_verdict)  # modules that launch kernels of ours
 REST = "the rest"
 
 
@@ -132,9 +132,9 @@ def _parts_of(env: SoftArmEnv) -> list[tuple[Any, str, str]]:
         (env, "_step", "step"),
         (env, "maybe_reset", "reset"),
         (env, "_frame", "frame"),
-        (soft_arm, "reward_terms", "reward"),
+        (simulation, "judge", "verdict"),
         (simulator, "sense", "sensing"),
-        (simulator, "count_contacts", "contacts"),
+        (simulator, "contacts", "contacts"),
         (simulator._actuation, "couple", "actuation"),
         (simulator.backend, "control_step", "rod"),
         (simulator.task, "sample", "scenes"),

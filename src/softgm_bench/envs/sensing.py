@@ -137,7 +137,7 @@ def look(
         return _nothing(agent_position, table)
     if sync.is_free(device):
         return _look_compiled(agent_position, cylinders, bins, table, sensing_radius, bin_length)
-    if sync.runs_kernels(device):
+    if sync.runs_kernels(device) and table.bin_of_slot.shape[1]:  # kernels take no empty arrays
         return _look_on_gpu(agent_position, bins, table, sensing_radius)
     return look_dense(agent_position, bins, table, sensing_radius)
 

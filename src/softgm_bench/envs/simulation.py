@@ -17,6 +17,7 @@ from softgm_bench.envs.curriculum import Progress, difficulty, first_progress, n
 from softgm_bench.envs.perturbation import Perturbation, PerturbationConfig
 from softgm_bench.envs.sensing import Bins, Sight, SlotTable, bins_per_cylinder, cut_into_bins, empty_table, look
 from softgm_bench.envs.tasks.base import Scene, Task
+from softgm_bench.envs.verdict import Step, Verdict, judge
 from softgm_bench.rod import sync
 from softgm_bench.rod.actuation import DIRECTIONS, Actuation, control_points
 from softgm_bench.rod.backend import Backend
@@ -70,27 +71,17 @@ class Simulation(TensorClass):
 
 
 class Outcome(NamedTuple):
-    """One control step of every environment, beside the state that it led to; ``(num_envs,)`` where nothing is said.
+    """One control step of every environment, beside the state that it led to.
 
     Attributes:
-        action: as the sections applied it, ``(num_envs, n_agents, 2)``.
-        previous_action: that of the step before, of the same shape.
-        distance: tip to target after the step, m.
-        previous_distance: and before it.
-        tip_step: way of the tip, m.
         sight: what the agents sense after the step.
-        success: whether the tip is within the task's radius, bool.
-        broken: whether the simulation broke, bool.
+        broken: whether the simulation broke, ``(num_envs,)`` bool.
+        verdict: on the step.
     """
 
-    action: Tensor
-    previous_action: Tensor
-    distance: Tensor
-    previous_distance: Tensor
-    tip_step: Tensor
     sight: Sight
-    success: Tensor
     broken: Tensor
+    verdict: Verdict
 
 
 class Beginning(NamedTuple):
@@ -283,7 +274,7 @@ class Simulator:
         """
         state, config = self.state, self.task.config
         now = state.episodes
-        rod, target, previous_action = now.rod, now.scene.target, now.previous_action
+        rod, previous_action = now.rod, now.previous_action
         active = ~(now.terminated | now.truncated)
         force = None
         if self.perturbation is not None:
@@ -300,28 +291,26 @@ class Simulator:
         if sync.any_true(broken):
             moved = rod.where(broken, moved)
         now.rod, now.previous_action = moved, action
-        now.steps = now.steps + active
         sight = self.sense(now)
         now.table = sight.table
-        tip, previous_tip = moved.position[..., -1], rod.position[..., -1]
-        distance = (tip - target).norm(dim=-1)
-        success = (distance < config.success_radius) & ~broken
-        terminated = now.terminated | (active & (success | broken))
-        now.terminated = terminated
-        now.truncated = now.truncated | (active & (now.steps >= self.horizon) & ~terminated)
-        if self.curriculum:
-            ended = active & (terminated | now.truncated)
-            state.progress = note_ends(state.progress, ended, success, config.curriculum)
-        return Outcome(
+        step = Step(
+            before=rod.position,
+            after=moved.position,
+            target=now.scene.target,
             action=action,
             previous_action=previous_action,
-            distance=distance,
-            previous_distance=(previous_tip - target).norm(dim=-1),
-            tip_step=(tip - previous_tip).norm(dim=-1),
-            sight=sight,
-            success=success,
+            touching=self.contacts(now),
+            new_bins=sight.new,
             broken=broken,
+            terminated=now.terminated,
+            truncated=now.truncated,
+            steps=now.steps,
         )
+        verdict = judge(step, config, self.horizon)
+        now.steps, now.terminated, now.truncated = verdict.steps, verdict.terminated, verdict.truncated
+        if self.curriculum:
+            state.progress = note_ends(state.progress, verdict.ended, verdict.success, config.curriculum)
+        return Outcome(sight=sight, broken=broken, verdict=verdict)
 
     # readings
 
@@ -337,7 +326,13 @@ class Simulator:
 
     def contacts(self, episodes: Episodes) -> Tensor:
         """Tell which nodes touch a cylinder, ``(num_envs, n_nodes)`` bool."""
+        if not self.task.max_cylinders:
+            return self._untouched(len(episodes.steps))
         return contact_nodes(episodes.rod.position, self._volume, episodes.scene.cylinders)
+
+    def _untouched(self, count: int) -> Tensor:
+        never = torch.zeros((), dtype=torch.bool, device=self.device)
+        return never.expand(count, self.backend.parameters.n_nodes)
 
     def count_contacts(self, episodes: Episodes) -> Tensor:
         """Count the nodes in contact, C_t, ``(num_envs,)`` int64."""

@@ -11,7 +11,6 @@ from torchrl.envs import EnvBase
 from softgm_bench.envs import entries
 from softgm_bench.envs.interface import Sizes
 from softgm_bench.envs.perturbation import PerturbationConfig
-from softgm_bench.envs.reward import reward_terms
 from softgm_bench.envs.sensing import Sight
 from softgm_bench.envs.simulation import Episodes, Simulator
 from softgm_bench.envs.specs import make_specs
@@ -150,30 +149,10 @@ class SoftArmEnv(EnvBase):
         return tensordict
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        config, episodes = self.task.config, self.simulator.state.episodes
+        episodes = self.simulator.state.episodes
         outcome = self.simulator.step(tensordict.get(entries.ACTION).clamp(-1.0, 1.0))
-        touching = self.simulator.count_contacts(episodes)
-        terms = reward_terms(
-            config.reward,
-            distance=outcome.distance,
-            previous_distance=outcome.previous_distance,
-            action=outcome.action,
-            previous_action=outcome.previous_action,
-            contact_nodes=touching,
-            new_bins=outcome.sight.new,
-            success=outcome.success,
-        )
-        torque = config.actuation.max_torque * outcome.action
-        numbers = {
-            entries.DISTANCE: outcome.distance,
-            entries.TIP_STEP: outcome.tip_step,
-            entries.CONTACT_NODES: touching,
-            entries.TORQUE_PER_AGENT: torque.norm(dim=-1).mean(dim=-1),  # the paper's formula
-            entries.TORQUE_JOINT: torque.flatten(1).norm(dim=-1),  # the scale of the paper's table
-            entries.REWARD: sum(terms.values(), torch.zeros_like(outcome.distance)),
-            **{(entries.REWARD_TERMS, name): value for name, value in terms.items()},
-        }
-        return self._frame(episodes, outcome.sight, numbers, outcome.success, outcome.broken)
+        verdict = outcome.verdict
+        return self._frame(episodes, outcome.sight, verdict.numbers, verdict.success, outcome.broken)
 
     # frames
 
@@ -187,43 +166,48 @@ class SoftArmEnv(EnvBase):
             **dict.fromkeys((entries.TIP_STEP, entries.TORQUE_PER_AGENT, entries.TORQUE_JOINT), zero),
             **{(entries.REWARD_TERMS, name): zero for name in entries.REWARD_TERM_NAMES},
         }
-        return self._frame(episodes, sight, numbers, never, never.clone())
+        return self._frame(episodes, sight, numbers, never, never)
 
     def _frame(
         self, episodes: Episodes, sight: Sight, numbers: Mapping[NestedKey, Tensor], success: Tensor, broken: Tensor
     ) -> TensorDict:
         """Make everything that a step or a reset writes, in tensors of its own.
 
-        ``numbers`` are ``(num_envs,)`` of any type and become float32 ``(num_envs, 1)``.
+        ``numbers`` are ``(num_envs,)`` of any type and become float32 ``(num_envs, 1)``, unless they are that already.
         """
-        numbers = {**numbers, entries.DISCOVERED: sight.table.count, entries.DROPPED: sight.table.dropped}
+        columns = {key: value for key, value in numbers.items() if value.ndim == 2}
+        numbers = {key: value for key, value in numbers.items() if value.ndim == 1}
+        numbers |= {entries.DISCOVERED: sight.table.count, entries.DROPPED: sight.table.dropped}
         if self.simulator.curriculum:
             numbers[entries.DIFFICULTY] = episodes.difficulty
         position, at_agents = episodes.rod.position, self.simulator.at_agents
         own = (
-            _float32(at_agents(position)),
-            _float32(at_agents(episodes.rod.velocity)),
+            at_agents(position).to(torch.float32),
+            at_agents(episodes.rod.velocity).to(torch.float32),
             episodes.previous_action.clone(),
         )
         if self.simulator.perturbation is not None:
             own = self.simulator.perturbation.observed(*own)
-        terminated, truncated = episodes.terminated.unsqueeze(-1), episodes.truncated.unsqueeze(-1)
+        ends = (success, broken, episodes.terminated, episodes.truncated, episodes.terminated | episodes.truncated)
+        success, broken, terminated, truncated, done = torch.stack(ends).unsqueeze(-1).unbind(0)
+        tip, target = torch.stack([position[..., -1], episodes.scene.target]).to(torch.float32).unbind(0)
         values: dict[NestedKey, Tensor] = {
             **dict(zip((entries.AGENT_POSITION, entries.AGENT_VELOCITY, entries.PREVIOUS_ACTION), own, strict=True)),
             entries.EDGE: sight.edge,
             entries.SLOT_DESCRIPTOR: sight.descriptor,
             entries.SLOT_ACTIVE: sight.active,
-            entries.TIP: _float32(position[..., -1]),
-            entries.TARGET: _float32(episodes.scene.target),
-            entries.SUCCESS: success.unsqueeze(-1),
-            entries.DIVERGED: broken.unsqueeze(-1),
-            entries.TERMINATED: terminated.clone(),
-            entries.TRUNCATED: truncated.clone(),
-            entries.DONE: terminated | truncated,
+            entries.TIP: tip,
+            entries.TARGET: target,
+            entries.SUCCESS: success,
+            entries.DIVERGED: broken,
+            entries.TERMINATED: terminated,
+            entries.TRUNCATED: truncated,
+            entries.DONE: done,
+            **columns,
             **dict(zip(numbers, _columns(*numbers.values()), strict=True)),
         }
         if self.sizes.n_privileged:
-            values[entries.PRIVILEGED] = _float32(episodes.scene.privileged)
+            values[entries.PRIVILEGED] = episodes.scene.privileged.to(torch.float32, copy=True)
         return entries.frame(values, episodes.batch_size, self.sizes, self.device)
 
     # checkpoints
@@ -286,7 +270,3 @@ def _merged(mask: Tensor, new: Mapping[NestedKey, Tensor], old: TensorDictBase) 
 def _columns(*values: Tensor) -> tuple[Tensor, ...]:
     """Turn ``(num_envs,)`` of any numbers into ``(num_envs, 1)`` float32."""
     return torch.stack(values).to(torch.float32).unsqueeze(-1).unbind(0)
-
-
-def _float32(value: Tensor) -> Tensor:
-    return value.to(torch.float32, copy=True)

@@ -29,7 +29,8 @@ def contact_nodes(position: Tensor, volume: Tensor, cylinders: Cylinders) -> Ten
         bool, ``(num_envs, n_nodes)``.
     """
     if not sync.is_free(position.device):
-        if not sync.runs_kernels(position.device, position.shape[-1]):
+        # kernels take no empty arrays
+        if not cylinders.mask.shape[1] or not sync.runs_kernels(position.device, position.shape[-1]):
             return contact_nodes_dense(position, volume, cylinders)
         from softgm_bench.rod import cuda_checks  # only where Numba's CUDA target is
 

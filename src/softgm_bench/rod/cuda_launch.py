@@ -26,10 +26,11 @@ REAL = {torch.float64: np.float64, torch.float32: np.float32}  # what kernels co
 def launch(kernel: Any, blocks: int, threads: int, tensors: Sequence[Tensor], *scalars: Any) -> None:
     """Enqueue a kernel on the current stream of the tensors' device, with the tensors and then ``scalars``.
 
-    A block is an environment; without any there is nothing to launch.
+    Without blocks there is nothing to launch. No tensor may be empty.
     """
     if not blocks:
         return
+    tensors = [tensor.detach() for tensor in tensors]  # gradients do not pass through kernels
     if SIMULATED:
         kernel[blocks, threads](*(tensor.numpy() for tensor in tensors), *scalars)
         return

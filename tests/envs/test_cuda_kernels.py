@@ -1,0 +1,60 @@
+"""The environment's CUDA kernels: their results under Numba's simulator, their machine code without a GPU."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+import cuda_code
+import cuda_simulator
+from softgm_bench.envs import cuda_sensing, cuda_verdict
+
+HERE = Path(__file__).parent
+SCRIPTS = {name: HERE / f"cuda_simulated_{name}.py" for name in ("sensing", "verdict")}
+CASES = [(name, test) for name, script in SCRIPTS.items() for test in cuda_simulator.names(script)]
+DTYPES = [torch.float64, torch.float32]
+compiles = pytest.mark.skipif(bool(cuda_code.why_not()), reason=str(cuda_code.why_not()))
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> dict[str, cuda_simulator.Results]:
+    return {name: cuda_simulator.run(script, tmp_path_factory.mktemp(name)) for name, script in SCRIPTS.items()}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("script", "name"), CASES)
+def test_simulated(simulated: dict[str, cuda_simulator.Results], script: str, name: str):
+    assert not cuda_simulator.failures(simulated[script], name)
+
+
+def no_larger_than_needed(code: str, folder: Path) -> None:
+    used = cuda_code.assembled(code, folder)
+    assert used["registers"] <= 64
+    assert used["spills"] == used["stack"] == 0
+
+
+@compiles
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_sensing_rounds_every_product_and_stays_in_its_precision(dtype: torch.dtype, tmp_path: Path):
+    table = (torch.zeros(2, 128, dtype=torch.int64), torch.zeros(2, 560, dtype=torch.bool))
+    counts = (torch.zeros(2, dtype=torch.int64),) * 2
+    agents, descriptor = torch.zeros(2, 6, 3, dtype=dtype), torch.zeros(2, 560, 9, dtype=dtype)
+    launched = cuda_code.launched(
+        cuda_sensing, lambda: cuda_sensing.look(agents, descriptor, table[1], (*table, *counts), 0.15)
+    )
+    code = cuda_code.ptx(*launched)
+    assert (".f64" in code) == (dtype == torch.float64)
+    assert not cuda_code.fuses(code)
+    no_larger_than_needed(code, tmp_path)
+
+
+@compiles
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_the_verdict_stays_in_its_precision(settings, dtype: torch.dtype, tmp_path: Path):
+    nodes, truths, whole = torch.zeros(2, 3, 61, dtype=dtype), torch.zeros(2, 61, dtype=torch.bool), torch.zeros(2)
+    action, flag, count = torch.zeros(2, 6, 2), truths[:, 0].clone(), whole.long()
+    step = (nodes, nodes, nodes[..., 0].clone(), action, action, truths, count, flag, flag, flag, count)
+    config = settings("task=wall").task
+    code = cuda_code.ptx(*cuda_code.launched(cuda_verdict, lambda: cuda_verdict.judge(step, config, 200)))
+    assert (".f64" in code) == (dtype == torch.float64)
+    no_larger_than_needed(code, tmp_path)
