@@ -12,6 +12,8 @@ from softgm_bench.envs.interface import Environment, Sizes
 class Algorithm(Protocol):
     """The interface of an algorithm for the loop of a run.
 
+    One that also has ``use_graphs()`` is asked to record its gradient steps as CUDA graphs where the settings say so.
+
     Attributes:
         policy: reads ``entries.OBSERVATION`` (and ``entries.PRIVILEGED`` as an oracle), writes ``entries.ACTION``;
             explores under ``ExplorationType.RANDOM`` and is deterministic under ``ExplorationType.DETERMINISTIC``. The

@@ -161,21 +161,34 @@ class SoftGMEncoder(Encoder):
         return agents
 
     def _slot_stage(self, td: TensorDictBase, agents: Tensor, pending: Affine | None, record: Record) -> Tensor:
-        """Stage 1 as ``_entity_stage`` computes it, from all M slots."""
+        """Stage 1 as ``_entity_stage`` computes it, from all M slots.
+
+        ``W_in`` is absorbed with residual connections too: a slot hears only itself, so they are linear there as well.
+        """
         absent = graph.absent_slots(td)
-        slots, slot_pending = self._enter(graph.all_slots(td), graph.OBSTACLE)  # (B, M, 15 or hidden)
+        slots, slot_pending = graph.all_slots(td), self._input_of(graph.OBSTACLE)  # (B, M, 15), later (B, M, hidden)
         for depth, layer in enumerate(_layers(self.stage1), start=1):
             last = depth == len(self.stage1)
             affine = after(layer.weight, slot_pending)
             own = layer.project_agents(agents, pending)
             out, own_weights, slot_weights = layer.slots_to_agent(own, slots, affine, absent)
-            if not last:  # a slot hears only itself, as obstacles do
-                message = functional.linear(slots, *affine) + layer.bias
-                slots, slot_pending = self._between(message, slots, last=False), None
+            if not last:
+                slots, slot_pending = functional.elu(self._slot_message(slots, affine, slot_pending, layer.bias)), None
             agents, pending = self._between(out, agents, last=last and not len(self.stage2)), None
             if record is not None:
                 record.append(slot_attention(own_weights, slot_weights))
         return agents
+
+    def _slot_message(self, slots: Tensor, affine: Affine, pending: Affine | None, bias: Tensor) -> Tensor:
+        """What slots make of themselves before the nonlinearity, ``(B, M, hidden)``.
+
+        ``affine`` gives their messages and ``pending``, unless it is None, the embeddings that they stand for.
+        """
+        weight, offset = affine[0], bias if affine[1] is None else affine[1] + bias
+        if self.config.residual and pending is not None:
+            weight, offset = weight + pending[0], offset if pending[1] is None else offset + pending[1]
+        out = functional.linear(slots, weight, offset)
+        return out + slots if self.config.residual and pending is None else out
 
     def _agent_stage(self, agents: Tensor, pending: Affine | None, n_agents: int, record: Record) -> Tensor:
         """Stage 2: ``(B N, hidden)`` after L layers of agent <-> agent messages."""
@@ -193,12 +206,16 @@ class SoftGMEncoder(Encoder):
 
     def _enter(self, channels: Tensor, node_type: int) -> tuple[Tensor, Affine | None]:
         """``h^(0)`` of nodes of one type; or, if a layer follows that can absorb ``W_in``, their channels and W_in."""
-        weight = self.input.weight
-        offset = weight[:, graph.NODE_FEATURES :] @ self.types.weight[node_type]
-        pending = (weight[:, : graph.CHANNELS], offset)
+        pending = self._input_of(node_type)
         if self.config.residual or not (len(self.stage1) or len(self.stage2)):
             return functional.linear(channels, *pending), None
         return channels, pending
+
+    def _input_of(self, node_type: int) -> Affine:
+        """``W_in`` for nodes of one type, as a linear map of their channels."""
+        weight = self.input.weight
+        offset = weight[:, graph.NODE_FEATURES :] @ self.types.weight[node_type]
+        return weight[:, : graph.CHANNELS], offset
 
     def _between(self, out: Tensor, before: Tensor, *, last: bool) -> Tensor:
         if self.config.residual:
