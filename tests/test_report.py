@@ -133,6 +133,24 @@ def test_every_source_is_named(made):
     }
 
 
+def test_success_by_step_ends_at_the_success_rate_and_never_falls(made):
+    text = (made / "out" / "report.md").read_text()
+    table = rows(text, "Success by control step")
+    wall = {row[0]: row for row in rows(text, "Table I, Wall with hole")}
+    assert [row[:3] for row in table if row[0] == "Wall with hole"] == [
+        ["Wall with hole", "MAPPO", "1 × 100"],
+        ["Wall with hole", "SoftGM", "3 × 100"],
+        ["Wall with hole", "SoftGM without stage 1", "1 × 100"],
+        ["Wall with hole", "MAPPO, oracle†", "1 × 100"],
+    ]
+    for row in table:
+        shares = [float(share) for share in row[3:]]
+        assert len(shares) == 5
+        assert shares == sorted(shares)
+        if row[0] == "Wall with hole" and row[1] in wall:
+            assert row[-1] == wall[row[1]][3]
+
+
 def test_interventions_are_compared_with_the_same_episodes_without(made):
     compared, refused = rows((made / "out" / "report.md").read_text(), "Interventions:")
     assert compared[:6] == ["Wall with hole", "SoftGM", "Nominal", "blind", "0", "100"]

@@ -76,9 +76,8 @@ def _evaluate(arguments: list[str]) -> None:
 
     trained = policy.load(source, options.device, overrides)
     options.check_fits(trained)
-    unusual = {"horizon": options.horizon, "sampled": not options.deterministic}
-    if options.intervention != "none":
-        unusual["intervention"] = options.intervention
+    intervention = None if options.intervention == "none" else options.intervention
+    unusual = {"horizon": options.horizon, "intervention": intervention, "sampled": not options.deterministic}
     folder = Path(options.out or evaluation_folder.default_folder(source, trained, overrides, options.seed, unusual))
     evaluation_folder.check(folder, options.overwrite)
     set_threads(options.threads)
@@ -88,7 +87,7 @@ def _evaluate(arguments: list[str]) -> None:
     seconds = time.perf_counter() - began
     summary = evaluation_folder.describe(trained, records, options.describe(trained, overrides))
     under = trained.config.perturbation.name
-    shown = f", intervention {options.intervention}" if options.intervention != "none" else ""
+    shown = f", intervention {intervention}" if intervention else ""
     title = f"{trained.label} on {summary['task']}, perturbation {under}{shown}, seed {options.seed}:"
     print(table(summary["metrics"], title), flush=True)  # before anything is written: a full disk leaves it
     try:

@@ -7,8 +7,8 @@ from torchrl.envs.utils import exploration_type
 
 from dense import force_dense
 from softgm_bench.envs import entries, make_env
-from softgm_bench.episodes.evaluation import evaluate, evaluate_in_parts, evaluation_seed
-from softgm_bench.episodes.summary import summarise, wilson_interval
+from softgm_bench.episodes.evaluation import EpisodeRecords, evaluate, evaluate_in_parts, evaluation_seed
+from softgm_bench.episodes.summary import STEPS, success_by_step, summarise, table, wilson_interval
 from softgm_bench.rod.parameters import RodParameters
 from softgm_bench.runs.loop import derive_seeds
 
@@ -157,3 +157,32 @@ def test_evaluations_never_draw_what_training_draws():
     own = {evaluation_seed(seed, part) for seed in numbers for part in range(3)}
     assert len(own) == 300
     assert not own & {word for seed in numbers for word in derive_seeds(seed)}
+
+
+def test_success_by_a_step_counts_the_successes_that_took_no_longer_and_no_failure():
+    columns = {"length": np.array([50, 51, 30, 400]), "success": np.array([True, True, False, False])}
+    assert success_by_step(columns, 400) == {"50": 0.25, "100": 0.5, "200": 0.5, "400": 0.5}
+    assert success_by_step(columns, 399) == {"50": 0.25, "100": 0.5, "200": 0.5}
+    assert success_by_step(columns, 49) == success_by_step(columns, None) == {}
+
+
+def test_a_summary_has_success_by_step_as_far_as_the_episodes_may_last():
+    """The last is the success rate where it is the horizon; the printed table shows each."""
+    columns = {"length": np.array([7, 200, 90]), "success": np.array([True, False, True])}
+    metrics = summarise(EpisodeRecords(columns, horizon=200))
+    assert metrics["success_by_step"] == {"50": 1 / 3, "100": 2 / 3, "200": 2 / 3}
+    assert metrics["success_by_step"]["200"] == metrics["success_rate"]["mean"]
+    assert "success by step 50   0.333\n" in table(metrics, "") + "\n"
+    for records in (EpisodeRecords(columns, horizon=10), EpisodeRecords({"length": columns["length"]}, horizon=200)):
+        assert "success_by_step" not in summarise(records)
+    assert STEPS[-1] == 2000
+
+
+def test_records_know_how_long_episodes_may_last(settings):
+    rod = RodParameters(n_elements=20, substeps=5)
+
+    def build(count, seed):
+        return make_env(settings("task=basic").task, rod, num_envs=count, seed=seed, horizon=2)
+
+    act = TensorDictModule(lambda tip: torch.zeros(*tip.shape[:-1], 6, 2), [entries.TIP], [entries.ACTION])
+    assert evaluate_in_parts(act, build, 3, deterministic=True, seed=0, at_once=2).horizon == 2

@@ -69,7 +69,8 @@ def _comparison(pools: Pools, bootstrap: Bootstrap) -> list[Block | None]:
             there = [*paper.ALGORITHMS, *sorted(others, key=lambda label: not pools[task, label].ranked)]
         blocks.append(tables.table_one(task, pools, there, bootstrap))
     others = sorted({label for task, label in pools if task in paper.TASKS} - known)
-    return [*blocks, figures.time_to_target(pools, paper.TASKS, [*paper.ALGORITHMS, *others])]
+    time_to_target = figures.time_to_target(pools, paper.TASKS, [*paper.ALGORITHMS, *others])
+    return [*blocks, time_to_target, tables.success_by_step(pools) if pools else None]
 
 
 def _robustness(found: Found, pools: Pools, bootstrap: Bootstrap) -> list[Block | None]:

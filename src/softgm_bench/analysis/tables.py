@@ -107,6 +107,31 @@ def _rank(pool: Pool | None, rank: int | None) -> Cell | str:
     return str(rank)
 
 
+def success_by_step(pools: Pools) -> Table:
+    """Show how many episodes have succeeded by so many control steps, for everything that was run."""
+    from softgm_bench.episodes.summary import STEPS, success_by_step  # brings torch along
+
+    columns = [*_texts("Task", "Algorithm"), *_numbers("seeds × episodes")]
+    columns += _numbers(*(f"{step:,}" for step in STEPS), group="Success by step, %")
+    recorded = {key: pool for key, pool in sorted(pools.items(), key=_by_task) if pool.success_rates is not None}
+    rows: list[Row] = []
+    for (task, label), pool in recorded.items():
+        by_seed = [success_by_step(one.episodes, one.horizon) for one in pool.evaluations]
+        shares = [[of_seed[step] for of_seed in by_seed if step in of_seed] for step in map(str, STEPS)]
+        means = [names.percent(sum(found) / pool.seeds) if len(found) == pool.seeds else DASH for found in shares]
+        rows.append([names.task(task), _name(label, pool), _size(pool), *means])
+    there = list(recorded.values())
+    caption = f"Success by control step, mean over seeds; a dash: episodes were not that long. {_protocol(there)}"
+    return _table("by-step", caption, columns, rows, _notes(there))
+
+
+def _by_task(item: tuple[tuple[str, str], Pool]) -> tuple:
+    """Order as the tables above do: the paper's tasks and algorithms first, others by name."""
+    (task, label), _ = item
+    orders = (list(paper.TASKS), task), ([*paper.ALGORITHMS, *paper.ABLATIONS], label)
+    return *(order.index(name) if name in order else len(order) for order, name in orders), task, label
+
+
 def table_two(nominal: Pools, conditions: Conditions, bootstrap: Bootstrap) -> Table:
     """Put the paper's Table II beside every task, algorithm and condition that was evaluated."""
     columns = [*_texts("Task", "Algorithm", "Condition"), *_numbers("seeds × episodes"), *BESIDE_THE_PAPER]

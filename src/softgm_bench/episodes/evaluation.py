@@ -26,10 +26,14 @@ class EpisodeRecords(Mapping[str, Values]):
     """One number per episode in every column, ``(episodes,)``; columns are those of ``entries.EPISODE_COLUMNS``.
 
     A column is absent where the task does not tell it. Bool columns say whether something ever happened in the episode.
+
+    Attributes:
+        horizon: most control steps of an episode; None if the environment does not say it.
     """
 
-    def __init__(self, columns: Mapping[str, Values]) -> None:
+    def __init__(self, columns: Mapping[str, Values], horizon: int | None = None) -> None:
         """Hold columns of equal lengths, in the order of the table of entries."""
+        self.horizon = horizon
         known = [column.name for column in entries.EPISODE_COLUMNS]
         self._columns = {name: columns[name] for name in known if name in columns}
 
@@ -115,7 +119,8 @@ def evaluate_in_parts(
         own = evaluation_seed(seed, part)
         env = build(min(size, episodes - first), own)
         parts.append(evaluate(policy, env, deterministic=deterministic, seed=own, gamma=gamma, show=show))
-    return EpisodeRecords({name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return EpisodeRecords(columns, parts[0].horizon)
 
 
 def evaluation_seed(seed: int, part: int = 0) -> int:
@@ -138,7 +143,7 @@ def _first_episodes(policy: TensorDictModuleBase, env: EnvBase, gamma: float, sh
         alive = alive & ~after[entries.DONE].squeeze(-1)
         data = step_mdp(data)
     assert tally is not None
-    return tally.records()
+    return tally.records(getattr(env, "horizon", None))
 
 
 class _Tally:
@@ -178,8 +183,8 @@ class _Tally:
         if self._last:
             self._ends = torch.where(going, _side_by_side(frame, self._last).double(), self._ends)
 
-    def records(self) -> EpisodeRecords:
-        """Give all that has been added."""
+    def records(self, horizon: int | None) -> EpisodeRecords:
+        """Give all that has been added, of episodes of at most ``horizon`` steps."""
         length = self._length.squeeze(-1)
         columns = {"length": length}
         tallies = (
@@ -193,7 +198,7 @@ class _Tally:
                 if column.reduction == entries.MEAN:
                     value = value / length
                 columns[column.name] = value.long() if column.reduction == entries.LAST_COUNT else value
-        return EpisodeRecords({name: values.cpu().numpy() for name, values in columns.items()})
+        return EpisodeRecords({name: values.cpu().numpy() for name, values in columns.items()}, horizon)
 
 
 def _side_by_side(frame: TensorDictBase, columns: Sequence[Column]) -> Tensor:

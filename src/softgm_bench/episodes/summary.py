@@ -8,6 +8,7 @@ import numpy as np
 
 from softgm_bench.episodes.evaluation import EpisodeRecords
 
+STEPS = (50, 100, 200, 400, 2000)  # control steps by which successes are counted, where episodes are as long
 RENAMED = {"length": "episode_length"}  # columns that summaries know by another name
 
 
@@ -15,6 +16,7 @@ def summarise(records: EpisodeRecords) -> dict[str, Any]:
     """Compute mean and standard deviation (over the episodes, population) of every column.
 
     Of what happened or did not there is the success rate with its 95 % interval, and otherwise the number of episodes.
+    ``success_by_step`` is the share of episodes that have succeeded by each of ``STEPS``, as far as the horizon goes.
     """
     metrics: dict[str, Any] = {"episodes": records.episodes}
     numbers: dict[str, Any] = {}
@@ -27,7 +29,20 @@ def summarise(records: EpisodeRecords) -> dict[str, Any]:
             metrics[name] = int(values.sum())
         else:
             numbers[RENAMED.get(name, name)] = {"mean": float(np.mean(values)), "std": float(np.std(values))}
+    if "success" in records and (by_step := success_by_step(records, records.horizon)):
+        metrics["success_by_step"] = by_step
     return metrics | numbers
+
+
+def success_by_step(episodes: Mapping[str, Any], horizon: int | None) -> dict[str, float]:
+    """Share of episodes that have succeeded by each of ``STEPS`` up to ``horizon``, by the step's number.
+
+    Args:
+        episodes: columns ``length`` and ``success``, ``(episodes,)`` each; a success is an episode's last step.
+        horizon: most control steps of an episode; None: unknown, which gives nothing.
+    """
+    reached = np.where(np.asarray(episodes["success"]) == 1, episodes["length"], np.inf)
+    return {str(step): float((reached <= step).mean()) for step in STEPS if horizon is not None and step <= horizon}
 
 
 def wilson_interval(successes: int, trials: int, z: float = 1.959963984540054) -> tuple[float, float]:
@@ -44,6 +59,7 @@ def table(metrics: Mapping[str, Any], title: str) -> str:
     rows = []
     if (success := metrics.get("success_rate")) is not None:
         rows.append(("success rate", f"{success['mean']:.3f}  [{success['low']:.3f}, {success['high']:.3f}]"))
+    rows += [(f"success by step {step}", f"{share:.3f}") for step, share in metrics.get("success_by_step", {}).items()]
     rows += [
         (name.replace("_", " "), f"{value['mean']:.3f} +- {value['std']:.3f}")
         for name, value in metrics.items()
