@@ -76,7 +76,7 @@ needs_mkdocs = pytest.mark.skipif(
 def test_the_site_builds_without_warnings(tmp_path):
     built = site(ROOT, tmp_path)
     assert built.returncode == 0, built.stderr
-    assert "Kinematic state of" in (tmp_path / "api/softgm_bench.rod.state.html").read_text()
+    assert "kinematic state of" in (tmp_path / "api/softgm_bench.rod.state.html").read_text()
     # what a page links to outside of docs/ comes along
     assert (tmp_path / "repository/benchmarks/results/models.json").exists()
     assert "repository/benchmarks/results/models.json" in (tmp_path / "models.html").read_text()
