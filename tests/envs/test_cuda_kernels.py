@@ -1,5 +1,9 @@
 """The environment's CUDA kernels: their results under Numba's simulator, their machine code without a GPU."""
 
+import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -25,6 +29,20 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> dict[str, cuda_simula
 @pytest.mark.parametrize(("script", "name"), CASES)
 def test_simulated(simulated: dict[str, cuda_simulator.Results], script: str, name: str):
     assert not cuda_simulator.failures(simulated[script], name)
+
+
+@pytest.mark.slow
+def test_a_step_launches_what_the_committed_count_says(tmp_path: Path):
+    root = HERE.parents[1]
+    command = [sys.executable, str(root / "benchmarks/count_operations.py"), f"--output={tmp_path / 'counted.json'}"]
+    subprocess.run(command, env=os.environ | {"NUMBA_ENABLE_CUDASIM": "1"}, cwd=root, check=True, timeout=600)
+
+    def steps(path: Path) -> list[dict]:
+        return [row for row in json.loads(path.read_text())["rows"] if row["what"] == "environment step"]
+
+    counted = steps(tmp_path / "counted.json")
+    assert counted == steps(root / "benchmarks/results/operations.json")
+    assert all(row["operations"] <= 150 for row in counted)
 
 
 def no_larger_than_needed(code: str, folder: Path) -> None:

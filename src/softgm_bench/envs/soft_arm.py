@@ -140,7 +140,6 @@ class SoftArmEnv(EnvBase):
             return tensordict
         mask = done.reshape(-1)
         rows, fresh, sight = self.simulator.begin_again(mask)
-
         first = self._first_frame(fresh, sight)
         if rows is None:
             _put(tensordict, _merged(mask, dict(_leaves(first)), tensordict))
