@@ -26,15 +26,11 @@ TINY = (
     "experiment.checkpoint.interval=32",
     "rod.n_elements=20",
 )
+pytestmark = pytest.mark.usefixtures("one_thread")
 SMALL = {
     "softgm": ("algo.epochs=2", "algo.minibatch_size=12"),
     "masac": ("algo.batch_size=8", "algo.random_frames=8", "algo.updates_per_frame=0.1", "algo.replay_capacity=100"),
 }
-
-
-@pytest.fixture(autouse=True)
-def _threads_as_before(one_thread):
-    yield
 
 
 def run(folder, name, graphs):

@@ -166,7 +166,8 @@ class SoftGMEncoder(Encoder):
         ``W_in`` is absorbed with residual connections too: a slot hears only itself, so they are linear there as well.
         """
         absent = graph.absent_slots(td)
-        slots, slot_pending = graph.all_slots(td), self._input_of(graph.OBSTACLE)  # (B, M, 15), later (B, M, hidden)
+        slots = graph.all_slots(td)  # (B, M, 15), later (B, M, hidden)
+        slot_pending: Affine | None = self._input_of(graph.OBSTACLE)
         for depth, layer in enumerate(_layers(self.stage1), start=1):
             last = depth == len(self.stage1)
             affine = after(layer.weight, slot_pending)
