@@ -11,7 +11,7 @@ from softgm_bench.rod.divergence import diverged, diverged_dense
 from softgm_bench.rod.parameters import RodParameters, rod_constants
 from softgm_bench.rod.state import straight_rods
 
-pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA GPU here")
+pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA GPU here")]
 
 ARM = RodParameters()
 GPU = torch.device("cuda", 0)

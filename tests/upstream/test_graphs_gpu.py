@@ -10,7 +10,7 @@ from softgm_bench.rod.parameters import RodParameters
 from softgm_bench.upstream import graphs
 from softgm_bench.upstream.collector import FrameCollector, RecordingCollector
 
-pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA GPU here")
+pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA GPU here")]
 
 SHORT = RodParameters(substeps=5)
 
