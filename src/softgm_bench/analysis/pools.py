@@ -11,7 +11,7 @@ from softgm_bench.analysis.statistics import Array, Bootstrap, mean
 
 ORACLE, CURRICULUM, PERTURBED = "†", "‡", "§"
 MARKS = {
-    ORACLE: "actors were told what they would have to discover: an upper bound",
+    ORACLE: "actors were told what they would have to discover; whether they use it, interventions tell",
     CURRICULUM: "trained with easier scenes first; evaluated, as all are, on the task itself",
     PERTURBED: "trained and evaluated under a perturbation",
 }

@@ -102,7 +102,7 @@ TARGET = _entry("target", shape=(3,))  # m
 OBSERVATION = tuple(TABLE)
 
 # The task knows this of a scene beyond the observation: for critics, which only training has, and for policies that are
-# labelled as upper bounds. Walls: the opening's centre (3) and side (1), m. Absent where P is 0.
+# labelled as oracles. Walls: the opening's centre (3) and side (1), m. Absent where P is 0.
 PRIVILEGED = _entry("privileged", shape=("P",))
 
 ACTION = _entry("agents", "action", shape=("N", "A"), bounded=True)
