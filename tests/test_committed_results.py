@@ -1,7 +1,9 @@
+import csv
 import importlib.util
 import itertools
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -49,6 +51,35 @@ def test_a_kept_policy_belongs_to_a_committed_run(path, results):
     task = trained.config.task.name
     assert path.stem == f"{task}_{trained.config.label}"
     assert trained.frames in [run.final.frames for run in results.runs(task) if run.final.label == trained.config.label]
+
+
+INTERVENTIONS = {
+    "what agents have sensed": "none",
+    "no obstacle": "blind",
+    "another scene's obstacles": "swap_obstacles",
+    "only what is sensed now": "sensed_only",
+    "bins without lengths": "hide_lengths",
+}
+
+
+@pytest.mark.parametrize(("algo", "column"), [("softgm", 0), ("mappo", 3)])
+def test_what_interventions_cost_is_stated_as_the_committed_episodes_have_it(algo, column, results):
+    folder = ROOT / "experiments" / "interventions" / "wall" / algo
+    page = results.PAGE.read_text()
+
+    def success(intervention):
+        with (folder / intervention / "episodes.csv").open() as episodes:
+            return np.array([int(float(row["success"])) for row in csv.DictReader(episodes)])
+
+    usual = success("none")
+    for words, intervention in INTERVENTIONS.items():
+        (row,) = [line for line in page.splitlines() if line.startswith(f"| {words} |")]
+        rate, changed = (cell.strip() for cell in row.split("|")[2 + column : 4 + column])
+        shown = success(intervention)
+        assert float(rate) == pytest.approx(shown.mean(), abs=5e-4)
+        if intervention != "none":
+            lost, won = (usual > shown).sum(), (shown > usual).sum()
+            assert changed == f"{lost}, {won}"
 
 
 @pytest.mark.parametrize("algo", ["softgm", "mappo"])
