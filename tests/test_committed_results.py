@@ -69,7 +69,7 @@ def test_what_interventions_cost_is_stated_as_the_committed_episodes_have_it(alg
 
     def success(intervention):
         with (folder / intervention / "episodes.csv").open() as episodes:
-            return np.array([int(float(row["success"])) for row in csv.DictReader(episodes)])
+            return np.array([row["success"] == "True" for row in csv.DictReader(episodes)])
 
     usual = success("none")
     for words, intervention in INTERVENTIONS.items():
