@@ -11,7 +11,6 @@ FREE = (
     "resume",
     "threads",
     "compile",
-    "matmul",
     "logger",
     "experiment.checkpoint",
     "recipe",
