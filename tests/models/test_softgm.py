@@ -183,12 +183,14 @@ def test_parameters_may_be_batched_with_vmap():
 
 @pytest.mark.parametrize("switches", SWITCHES, ids=str)
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-6), (torch.float64, 1e-12)])
-@pytest.mark.parametrize(("lead", "sensed"), [((2, 5), 0.4), ((3,), 0.0), ((), 1.0)], ids=str)
-def test_masked_slots_equal_packed_edges(switches, dtype, tolerance, lead, sensed):
+@pytest.mark.parametrize(
+    ("lead", "n_slots", "sensed"), [((2, 5), 6, 0.4), ((3,), 6, 0.0), ((), 6, 1.0), ((2, 3), 0, 0.0)], ids=str
+)
+def test_masked_slots_equal_packed_edges(switches, dtype, tolerance, lead, n_slots, sensed):
     """Forward, gradients and attention of the way that devices go which nobody may wait for."""
     torch.manual_seed(0)
     model = SoftGMEncoder(softgm_config(velocity_scale=0.5, hidden=128, heads=4, **switches), SIZES).to(dtype)
-    td = observation(lead, 4, 6, dtype=dtype, sensed=sensed, discovered=float(sensed > 0.0))
+    td = observation(lead, 4, n_slots, dtype=dtype, sensed=sensed, discovered=float(sensed > 0.0))
     parameters = list(model.parameters())
 
     def results():

@@ -108,14 +108,16 @@ def absent_neighbours(n_agents: int, device: torch.device, dtype: torch.dtype) -
 def absent_slots(td: TensorDictBase) -> Tensor:
     """0 where an agent senses a slot, else -inf: ``(B, N, 1, M)``, leading dimensions packed into B."""
     edge = td[entries.EDGE]
-    return edge.to(td[entries.SLOT_DESCRIPTOR].dtype).log().reshape(-1, edge.shape[-2], 1, edge.shape[-1])
+    shape = (edge.shape[:-2].numel(), edge.shape[-2], 1, edge.shape[-1])  # a task may have no slots at all
+    return edge.to(td[entries.SLOT_DESCRIPTOR].dtype).log().reshape(shape)
 
 
 def all_slots(td: TensorDictBase) -> Tensor:
     """Features of all slots, ``(B, M, 15)``, leading dimensions packed into B; those of PAD are finite, no more."""
     descriptor = td[entries.SLOT_DESCRIPTOR]
     target, tip = td[entries.TARGET].unsqueeze(-2), td[entries.TIP].unsqueeze(-2)
-    return obstacle_channels(descriptor, target, tip).reshape(-1, descriptor.shape[-2], CHANNELS)
+    shape = (descriptor.shape[:-2].numel(), descriptor.shape[-2], CHANNELS)
+    return obstacle_channels(descriptor, target, tip).reshape(shape)
 
 
 class Sensed(NamedTuple):
