@@ -97,6 +97,7 @@ assert 0.3 <= x.min() < x.max() <= 0.4, x
 assert -0.15 <= y.min() < -0.1 and 0.1 < y.max() <= 0.15, y
 
 config = api.configure("task=structured", "algo=reinforce", "model=deep_sets")
+torch.manual_seed(0)
 env = api.make_env("task=structured", num_envs=8, seed=0)
 algorithm = api.build_algorithm(config, env)
 
