@@ -4,10 +4,33 @@ import ast
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
+import pytest
+
 Results = dict[str, list[str | None]]  # of each test, one for each of its cases: None where it passed
+
+
+def suite(*scripts: Path) -> tuple[Any, Callable[..., None]]:
+    """Make a module's fixture ``simulated``, which runs the scripts, and the slow test that asks for each result.
+
+    A test module assigns them to the names ``simulated`` and ``test_simulated``.
+    """
+
+    @pytest.fixture(scope="module", name="simulated")
+    def simulated(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Results]:
+        return {script.stem: run(script, tmp_path_factory.mktemp("cuda")) for script in scripts}
+
+    @pytest.mark.slow
+    @pytest.mark.parametrize(("script", "name"), [(script.stem, name) for script in scripts for name in names(script)])
+    def test_simulated(simulated: dict[str, Results], script: str, name: str) -> None:
+        found = failures(simulated[script], name)
+        assert not found, found
+
+    return simulated, test_simulated
 
 
 def names(script: Path) -> list[str]:

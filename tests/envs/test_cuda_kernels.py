@@ -14,21 +14,10 @@ import cuda_simulator
 from softgm_bench.envs import cuda_sensing, cuda_verdict
 
 HERE = Path(__file__).parent
-SCRIPTS = {name: HERE / f"cuda_simulated_{name}.py" for name in ("sensing", "verdict")}
-CASES = [(name, test) for name, script in SCRIPTS.items() for test in cuda_simulator.names(script)]
 DTYPES = [torch.float64, torch.float32]
+SCRIPTS = [HERE / f"cuda_simulated_{name}.py" for name in ("sensing", "verdict")]
+simulated, test_simulated = cuda_simulator.suite(*SCRIPTS)
 compiles = pytest.mark.skipif(bool(cuda_code.why_not()), reason=str(cuda_code.why_not()))
-
-
-@pytest.fixture(scope="module")
-def simulated(tmp_path_factory: pytest.TempPathFactory) -> dict[str, cuda_simulator.Results]:
-    return {name: cuda_simulator.run(script, tmp_path_factory.mktemp(name)) for name, script in SCRIPTS.items()}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("script", "name"), CASES)
-def test_simulated(simulated: dict[str, cuda_simulator.Results], script: str, name: str):
-    assert not cuda_simulator.failures(simulated[script], name)
 
 
 @pytest.mark.slow

@@ -10,18 +10,7 @@ from softgm_bench.rod.cuda_backend import CudaBackend
 from softgm_bench.rod.parameters import RodParameters
 from softgm_bench.rod.state import straight_rods
 
-SIMULATED = Path(__file__).with_name("cuda_simulated.py")
-
-
-@pytest.fixture(scope="module")
-def simulated(tmp_path_factory: pytest.TempPathFactory) -> cuda_simulator.Results:
-    return cuda_simulator.run(SIMULATED, tmp_path_factory.mktemp("cuda"))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", cuda_simulator.names(SIMULATED))
-def test_simulated(simulated: cuda_simulator.Results, name: str):
-    assert not cuda_simulator.failures(simulated, name)
+simulated, test_simulated = cuda_simulator.suite(Path(__file__).with_name("cuda_simulated.py"))
 
 
 def test_a_state_that_is_not_on_a_cuda_device_is_refused():

@@ -11,19 +11,8 @@ from softgm_bench.rod import cuda_checks
 from softgm_bench.rod.parameters import RodParameters, rod_constants
 from softgm_bench.rod.state import Cylinders, straight_rods
 
-SIMULATED = Path(__file__).with_name("cuda_simulated_checks.py")
+simulated, test_simulated = cuda_simulator.suite(Path(__file__).with_name("cuda_simulated_checks.py"))
 ARM = RodParameters()
-
-
-@pytest.fixture(scope="module")
-def simulated(tmp_path_factory: pytest.TempPathFactory) -> cuda_simulator.Results:
-    return cuda_simulator.run(SIMULATED, tmp_path_factory.mktemp("cuda"))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", cuda_simulator.names(SIMULATED))
-def test_simulated(simulated: cuda_simulator.Results, name: str):
-    assert not cuda_simulator.failures(simulated, name)
 
 
 @pytest.mark.skipif(bool(cuda_code.why_not()), reason=str(cuda_code.why_not()))
