@@ -166,16 +166,12 @@ class OffPolicy:
 
     def use_graphs(self) -> None:
         """Take gradient steps as replays of a CUDA graph from now on."""
-        for optimizer in self.optimizers.values():
-            graphs.prepare_optimizer(optimizer)
-        device = next(self.loss.parameters()).device
-        self._recorded = graphs.Recorded(self._step, self._changed, device, "the gradient step")
+        optimizers = list(self.optimizers.values())
+        self._recorded = graphs.gradient_step(self._step, self._networks, optimizers, "the gradient step")
 
-    def _changed(self) -> list[Tensor]:
-        """Tensors that a gradient step changes: networks, target networks, optimisers."""
-        moments = [tensor for optimizer in self.optimizers.values() for tensor in graphs.optimizer_tensors(optimizer)]
-        held = [value for value in self.loss.state_dict().values() if isinstance(value, Tensor)]
-        return [*held, *moments]
+    def _networks(self) -> list[Tensor]:
+        """Networks and target networks."""
+        return [value for value in self.loss.state_dict().values() if isinstance(value, Tensor)]
 
     def update(self, batch: TensorDictBase) -> dict[str, float]:
         """Store frames, then take ``updates_per_frame`` gradient steps for each of them.

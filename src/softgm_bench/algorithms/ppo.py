@@ -149,19 +149,12 @@ class PPO:
 
     def use_graphs(self) -> None:
         """Take gradient steps as replays of a CUDA graph from now on, those on minibatches of the usual size."""
-        for optimizer in self._optimizers:
-            graphs.prepare_optimizer(optimizer)
-        device = self._actor_parameters[0].device
-        self._recorded = graphs.Recorded(self._step, self._changed, device, "PPO's gradient step")
+        networks = [*self._actor_parameters, *self._critic_parameters]
+        self._recorded = graphs.gradient_step(self._step, lambda: networks, self._optimizers, "PPO's gradient step")
 
     @property
     def _optimizers(self) -> tuple[torch.optim.Optimizer, torch.optim.Optimizer]:
         return self.actor_optimizer, self.critic_optimizer
-
-    def _changed(self) -> list[Tensor]:
-        """Tensors that a gradient step changes."""
-        moments = [tensor for optimizer in self._optimizers for tensor in graphs.optimizer_tensors(optimizer)]
-        return [*self._actor_parameters, *self._critic_parameters, *moments]
 
     def update(self, batch: TensorDictBase) -> dict[str, float]:
         """Improve actor and critic on fresh frames.

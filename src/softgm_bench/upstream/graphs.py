@@ -180,6 +180,29 @@ def prepare_optimizer(optimizer: torch.optim.Optimizer) -> None:
         tensor.zero_()
 
 
+def gradient_step(
+    step: Callable[[TensorDictBase], Tensor],
+    networks: Callable[[], Sequence[Tensor]],
+    optimizers: Sequence[torch.optim.Optimizer],
+    what: str,
+) -> Recorded:
+    """Give a gradient step that is recorded; the optimisers are made ready for that.
+
+    Args:
+        step: of a minibatch.
+        networks: gives the tensors that a step changes beside the optimisers' own.
+        optimizers: whose steps it takes.
+        what: names the step on stderr.
+    """
+    for optimizer in optimizers:
+        prepare_optimizer(optimizer)
+
+    def changed() -> list[Tensor]:
+        return [*networks(), *(tensor for optimizer in optimizers for tensor in optimizer_tensors(optimizer))]
+
+    return Recorded(step, changed, networks()[0].device, what)
+
+
 def optimizer_tensors(optimizer: torch.optim.Optimizer) -> list[Tensor]:
     """Give the tensors that an optimiser's step changes, beside the parameters."""
     values = (value for state in optimizer.state.values() for value in state.values())
