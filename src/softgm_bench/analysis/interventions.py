@@ -7,8 +7,6 @@ from softgm_bench.analysis.pools import condition
 from softgm_bench.analysis.runs import Evaluation
 from softgm_bench.analysis.statistics import Discordance, mcnemar
 
-NONE = "none"
-
 
 class Pair(NamedTuple):
     """An evaluation under an intervention and the same policy's without.
@@ -33,8 +31,8 @@ class Pair(NamedTuple):
 
 def pairs(evaluations: Sequence[Evaluation]) -> list[Pair]:
     """Pair every evaluation under an intervention, in order of task, algorithm, seed and intervention."""
-    plain = [one for one in evaluations if one.intervention == NONE]
-    intervened = [one for one in evaluations if one.intervention != NONE]
+    plain = [one for one in evaluations if not one.intervened]
+    intervened = [one for one in evaluations if one.intervened]
     found = [_paired(one, [other for other in plain if _policy(other) == _policy(one)]) for one in intervened]
     return sorted(found, key=lambda pair: (*_policy(pair.intervened), pair.intervened.intervention))
 

@@ -144,7 +144,7 @@ def pool_evaluations(evaluations: Sequence[Evaluation]) -> dict[tuple[str, str, 
     for evaluation in sorted(evaluations, key=_preference):
         key = (evaluation.task, evaluation.label, condition(evaluation))
         protocol = (evaluation.deterministic, evaluation.horizon)
-        usual = not evaluation.overrides and evaluation.intervention == "none"
+        usual = not evaluation.overrides and not evaluation.intervened
         if usual and protocols.setdefault(key, protocol) == protocol:
             groups.setdefault(key, {}).setdefault(evaluation.seed, evaluation)
     return {key: Pool(tuple(by_seed[seed] for seed in sorted(by_seed))) for key, by_seed in sorted(groups.items())}

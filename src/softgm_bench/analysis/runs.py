@@ -58,6 +58,11 @@ class Evaluation:
     intervention: str
     scenes: Mapping[str, Any]
 
+    @property
+    def intervened(self) -> bool:
+        """Tell whether the policy was shown something else than what its agents saw."""
+        return self.intervention != "none"
+
 
 @dataclass(frozen=True, eq=False)
 class Run:

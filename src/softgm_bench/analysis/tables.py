@@ -311,7 +311,7 @@ def evaluation_sources(evaluations: Sequence[Evaluation]) -> Table:
     columns = [*SOURCE, *_texts("Condition", "other settings"), *RESULT, *_texts("source")]
     rows: list[Row] = []
     for one in evaluations:
-        shown = [f"intervention={one.intervention}"] if one.intervention != "none" else []
+        shown = [f"intervention={one.intervention}"] if one.intervened else []
         settings = [names.perturbation(condition(one)), " ".join([*one.overrides, *shown])]
         rows.append([*_source(one), *settings, *_result(one), Cell(one.folder, muted=True)])
     caption = "Every evaluation beside training, with Wilson's 95 % interval over its episodes."

@@ -3,8 +3,8 @@
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-# What no number depends on (on threads and recording, only the last bits; on matmul, those of a GPU's products), or
-# only through other keys that are compared.
+# What no number depends on (on threads and recording, only the last bits), or only through other keys that are
+# compared.
 FREE = (
     "run_dir",
     "overwrite",
