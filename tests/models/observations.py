@@ -53,6 +53,7 @@ def softgm_config(**changes):
         "gatv2": False,
         "residual": False,
         "velocity_scale": 1.0,
+        "remember": False,
     }
     return SoftGMConfig(**(values | changes))
 

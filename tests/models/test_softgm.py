@@ -1,3 +1,4 @@
+import contextlib
 import itertools
 
 import pytest
@@ -15,7 +16,7 @@ from softgm_bench.models import SoftGMEncoder
 SWITCHES = [
     {"stage1": stage1, "stage2": stage2, "gatv2": gatv2, "residual": residual}
     for stage1, stage2, gatv2, residual in itertools.product([True, False], repeat=4)
-]
+] + [{"remember": True, "gatv2": gatv2, "residual": residual} for gatv2, residual in ((False, True), (True, False))]
 
 
 def encoder(dtype=torch.float32, seed=0, **changes):
@@ -55,6 +56,21 @@ def test_sparse_equals_dense_for_any_sizes(lead, sizes, seed):
     for stage in expected:
         torch.testing.assert_close(weights[stage], expected[stage], rtol=1e-12, atol=1e-12)
         torch.testing.assert_close(weights[stage].sum(-1), torch.ones_like(weights[stage][..., 0]))
+
+
+@pytest.mark.parametrize("remember", [False, True])
+@pytest.mark.parametrize("masked", [False, True])
+def test_what_nobody_senses_any_more_is_heard_by_those_alone_that_remember(remember, masked):
+    model = encoder(torch.float64, remember=remember)
+    td = observation((3,), 4, 6, sensed=0.0, discovered=1.0, dtype=torch.float64)
+    other = td.clone()
+    other[entries.SLOT_DESCRIPTOR] = other[entries.SLOT_DESCRIPTOR].roll(1, 0)
+    with force_dense() if masked else contextlib.nullcontext():
+        changed = (model(td) - model(other)).abs().amax(dim=(0, 2))
+        other[entries.SLOT_ACTIVE] = torch.zeros_like(other[entries.SLOT_ACTIVE])
+        without = model(other) - model(other.clone().set(entries.SLOT_DESCRIPTOR, td[entries.SLOT_DESCRIPTOR]))
+    assert (changed > 0).all() if remember else (changed == 0).all()
+    assert not without.any()  # what was not discovered is heard by nobody
 
 
 @pytest.mark.parametrize("gatv2", [False, True])

@@ -17,6 +17,7 @@ NEUTRAL: dict[str, Any] = {
     "algo.actor.embedding_norm": False,
     "algo.critic.embedding_norm": False,
     "algo.actor.relative_points": False,
+    "model.remember": False,
 }
 ABLATIONS = ("softgm_no_stage1", "softgm_no_stage2")  # algorithms then, models of the algorithm softgm now
 

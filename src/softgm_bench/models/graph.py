@@ -42,6 +42,7 @@ __all__ = [  # with the views, so that models name one module
     "flat_features",
     "flat_observation",
     "full_adjacency",
+    "heard_slots",
     "node_types",
     "obstacle_channels",
     "pad_channels",
@@ -76,13 +77,23 @@ def chain_adjacency(n_agents: int, device: torch.device | None = None) -> Tensor
     return (index.unsqueeze(0) - index.unsqueeze(1)).abs() == 1
 
 
-def full_adjacency(td: TensorDictBase) -> Tensor:
-    """The paper's A_t, bool ``(..., N + M, N + M)``: row u, column v true if a message may go from v to u.
+def heard_slots(td: TensorDictBase, discovered: bool) -> Tensor:
+    """Which slots' messages reach an agent, bool ``(..., N, M)``: those that it senses now, as in the paper.
 
-    Agents hear their neighbours on the chain and the obstacles that they sense; slots hear nobody. Self-loops belong
-    to the stages, not to A_t.
+    ``discovered``: every agent hears every slot that some agent has sensed in this episode. A slot keeps its index
+    until the episode ends, so the table of slots is a memory of the team, the one that an MLP reads.
     """
     edge = td[entries.EDGE]
+    return td[entries.SLOT_ACTIVE].unsqueeze(-2).expand_as(edge) if discovered else edge
+
+
+def full_adjacency(td: TensorDictBase, discovered: bool = False) -> Tensor:
+    """The paper's A_t, bool ``(..., N + M, N + M)``: row u, column v true if a message may go from v to u.
+
+    Agents hear their neighbours on the chain and the obstacles of ``heard_slots``; slots hear nobody. Self-loops belong
+    to the stages, not to A_t.
+    """
+    edge = heard_slots(td, discovered)
     n_agents, n_slots = edge.shape[-2:]
     adjacency = edge.new_zeros((*edge.shape[:-2], n_agents + n_slots, n_agents + n_slots))
     adjacency[..., :n_agents, :n_agents] = chain_adjacency(n_agents, edge.device)
@@ -105,9 +116,9 @@ def absent_neighbours(n_agents: int, device: torch.device, dtype: torch.dtype) -
     return (apart.triu(2) + apart.tril(-2)).unsqueeze(1)
 
 
-def absent_slots(td: TensorDictBase) -> Tensor:
-    """0 where an agent senses a slot, else -inf: ``(B, N, 1, M)``, leading dimensions packed into B."""
-    edge = td[entries.EDGE]
+def absent_slots(td: TensorDictBase, discovered: bool = False) -> Tensor:
+    """0 where an agent hears a slot, else -inf: ``(B, N, 1, M)``, leading dimensions packed into B."""
+    edge = heard_slots(td, discovered)
     shape = (edge.shape[:-2].numel(), edge.shape[-2], 1, edge.shape[-1])  # a task may have no slots at all
     return edge.to(td[entries.SLOT_DESCRIPTOR].dtype).log().reshape(shape)
 
@@ -121,7 +132,7 @@ def all_slots(td: TensorDictBase) -> Tensor:
 
 
 class Sensed(NamedTuple):
-    """The K obstacle nodes that some agent senses now, packed over the batch, and the E edges from them.
+    """The K obstacle nodes that some agent hears, packed over the batch, and the E edges from them.
 
     Attributes:
         channels: features of the nodes, ``(K, 15)``.
@@ -136,9 +147,9 @@ class Sensed(NamedTuple):
     slot: Tensor
 
 
-def sense(td: TensorDictBase) -> Sensed | None:
+def sense(td: TensorDictBase, discovered: bool = False) -> Sensed | None:
     """Gather what the entity -> agent edges need; None if there is no edge. Leading dimensions are packed into B."""
-    edge = td[entries.EDGE]
+    edge = heard_slots(td, discovered)
     n_agents, n_slots = edge.shape[-2:]
     position = edge.reshape(-1).nonzero().squeeze(-1)
     if position.numel() == 0:

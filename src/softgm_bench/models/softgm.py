@@ -43,6 +43,7 @@ class SoftGMConfig:
         gatv2: GATv2 scores instead of the paper's GAT scores.
         residual: add a layer's input to its output (paper: no).
         velocity_scale: factor of the agents' velocity channels at the input (paper: 1).
+        remember: every agent hears all slots that the team has discovered, not those alone that it senses (paper: no).
     """
 
     name: str
@@ -55,6 +56,7 @@ class SoftGMConfig:
     gatv2: bool
     residual: bool
     velocity_scale: float
+    remember: bool
 
     def __post_init__(self) -> None:
         """Refuse values that give no network.
@@ -112,7 +114,7 @@ class SoftGMEncoder(Encoder):
         nodes = self.input(torch.cat([graph.pad_channels(channels), self.types(graph.node_types(td))], dim=-1))
         lead = nodes.shape[:-2]
 
-        adjacency = graph.full_adjacency(td)
+        adjacency = graph.full_adjacency(td, self.config.remember)
         identity = torch.eye(n_agents + n_slots, dtype=torch.bool, device=nodes.device)
         is_agent = torch.arange(n_agents + n_slots, device=nodes.device) < n_agents
         record: dict[str, list[Tensor]] = {"stage1": [], "stage2": []}
@@ -139,7 +141,7 @@ class SoftGMEncoder(Encoder):
 
     def _entity_stage(self, td: TensorDictBase, agents: Tensor, pending: Affine | None, record: Record) -> Tensor:
         """Stage 1: ``(B N, hidden)`` after L layers of entity -> agent messages."""
-        sensed = graph.sense(td)
+        sensed = graph.sense(td, self.config.remember)
         if sensed is not None:
             entities, entity_pending = self._enter(sensed.channels, graph.OBSTACLE)
         for depth, layer in enumerate(_layers(self.stage1), start=1):
@@ -165,7 +167,7 @@ class SoftGMEncoder(Encoder):
 
         ``W_in`` is absorbed with residual connections too: a slot hears only itself, so they are linear there as well.
         """
-        absent = graph.absent_slots(td)
+        absent = graph.absent_slots(td, self.config.remember)
         slots = graph.all_slots(td)  # (B, M, 15), later (B, M, hidden)
         slot_pending: Affine | None = self._input_of(graph.OBSTACLE)
         for depth, layer in enumerate(_layers(self.stage1), start=1):
