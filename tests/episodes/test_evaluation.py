@@ -29,6 +29,7 @@ def test_every_environment_counts_its_first_episode_and_no_more():
     np.testing.assert_allclose(records["undiscounted_return"], [3, 1, 7])
     np.testing.assert_allclose(records["discounted_return"], [1.75, 1.0, 2 - 0.5**6])
     np.testing.assert_allclose(records["tip_travel_distance"], [1.5, 0.5, 3.5])
+    np.testing.assert_allclose(records["final_tip_step"], 0.5)
     np.testing.assert_allclose(records["final_distance"], [3, 1, 7])
     np.testing.assert_array_equal(records["success"], [True, False, True])
     np.testing.assert_array_equal(records["diverged"], [False, True, False])
@@ -118,6 +119,9 @@ def test_an_arms_episode_is_the_sum_of_what_its_steps_say(settings):
     np.testing.assert_array_equal(records["contact_steps"], (frames[entries.CONTACT_NODES] > 0).sum((1, 2)))
     np.testing.assert_array_equal(records["discovered_bins"], frames[entries.DISCOVERED][:, -1, 0])
     np.testing.assert_array_equal(records["dropped_bins"], frames[entries.DROPPED][:, -1, 0])
+    ways = frames[entries.TIP_STEP][..., 0].double().numpy()  # forgotten by a tenth a step; the first has all before it
+    weights = 0.1 * 0.9 ** np.arange(39, -1, -1) / np.array([0.1] + [1.0] * 39)
+    np.testing.assert_allclose(records["final_tip_step"], ways @ weights, rtol=1e-6)
     total = 0.0
     for name in entries.REWARD_TERM_NAMES:
         values = records[f"reward_{name}"]
@@ -176,6 +180,17 @@ def test_a_summary_has_success_by_step_as_far_as_the_episodes_may_last():
     for records in (EpisodeRecords(columns, horizon=10), EpisodeRecords({"length": columns["length"]}, horizon=200)):
         assert "success_by_step" not in summarise(records)
     assert STEPS[-1] == 2000
+
+
+def test_a_failure_is_motionless_if_its_tip_stood_still_at_the_end():
+    columns = {
+        "length": np.array([9, 9, 9, 9]),
+        "success": np.array([True, False, False, False]),
+        "final_tip_step": np.array([0.0, 0.9e-4, 1.1e-4, 0.0]),
+    }
+    assert summarise(EpisodeRecords(columns))["motionless_failures"] == 2
+    del columns["final_tip_step"]
+    assert "motionless_failures" not in summarise(EpisodeRecords(columns))
 
 
 def test_records_know_how_long_episodes_may_last(settings):

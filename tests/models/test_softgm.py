@@ -11,7 +11,7 @@ from torch.utils._pytree import tree_leaves
 from dense import force_dense
 from round_trips import RoundTrips
 from softgm_bench.envs import entries
-from softgm_bench.models import SoftGMEncoder
+from softgm_bench.models import SoftGMEncoder, graph
 
 SWITCHES = [
     {"stage1": stage1, "stage2": stage2, "gatv2": gatv2, "residual": residual}
@@ -71,6 +71,18 @@ def test_what_nobody_senses_any_more_is_heard_by_those_alone_that_remember(remem
         without = model(other) - model(other.clone().set(entries.SLOT_DESCRIPTOR, td[entries.SLOT_DESCRIPTOR]))
     assert (changed > 0).all() if remember else (changed == 0).all()
     assert not without.any()  # what was not discovered is heard by nobody
+
+
+@pytest.mark.parametrize("used", [0, 3, 6])
+def test_slots_that_are_empty_everywhere_are_left_out_where_all_are_remembered(used):
+    model = encoder(torch.float64, remember=True)
+    td = observation((5,), 4, 6, discovered=1.0, dtype=torch.float64)
+    unused = torch.arange(6) >= used
+    td[entries.EDGE] = td[entries.EDGE] & ~unused
+    td[entries.SLOT_ACTIVE] = td[entries.SLOT_ACTIVE] & ~unused
+    td[entries.SLOT_DESCRIPTOR] = td[entries.SLOT_DESCRIPTOR] * ~unused.unsqueeze(-1)
+    assert graph.without_empty_slots(td)[entries.EDGE].shape == (5, 4, used)
+    torch.testing.assert_close(model(td), model.forward_dense(td)[0], rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("gatv2", [False, True])

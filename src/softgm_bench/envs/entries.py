@@ -21,10 +21,11 @@ from softgm_bench.envs.interface import Sizes
 Dimension = int | str
 
 # How an episode or an iteration reduces an entry to one number.
-SUM, DISCOUNTED, MEAN, COUNT, EVER, LAST, LAST_COUNT, STEPS, MAX = (
+SUM, DISCOUNTED, MEAN, RECENT, COUNT, EVER, LAST, LAST_COUNT, STEPS, MAX = (
     "sum",
     "discounted sum",
     "mean",
+    "mean that forgets, a tenth a step",
     "number of steps above 0",
     "ever",
     "last",
@@ -116,7 +117,9 @@ TRUNCATED = _entry("truncated", dtype=torch.bool)  # the horizon alone
 # Metrics, which no policy reads.
 SUCCESS = _entry("info", "success", dtype=torch.bool, episode={"success": EVER})
 DIVERGED = _entry("info", "diverged", dtype=torch.bool, episode={"diverged": EVER})
-TIP_STEP = _entry("info", "tip_step", episode={"tip_travel_distance": SUM})  # way of the tip in this control step, m
+TIP_STEP = _entry(  # way of the tip in this control step, m
+    "info", "tip_step", episode={"tip_travel_distance": SUM, "final_tip_step": RECENT}
+)
 DISTANCE = _entry(  # tip to target, m
     "info", "distance", episode={"final_distance": LAST}, iteration=("tip_distance", MEAN)
 )

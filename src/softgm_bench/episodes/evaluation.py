@@ -17,6 +17,7 @@ from softgm_bench.envs.entries import Column
 from softgm_bench.rod import sync
 
 DISCOUNT = 0.99  # of the returns that are reported, whatever an algorithm trains with
+FORGOTTEN = 0.1  # share of what came before that a recent mean forgets in a step
 CHECK_EVERY = 16  # steps between two checks whether an episode goes on, on a device that a check waits for
 
 Values = NDArray[np.float64] | NDArray[np.int64] | NDArray[np.bool_]
@@ -160,6 +161,7 @@ class _Tally:
 
         self._summed, self._counted = chosen(entries.DISCOUNTED, entries.SUM, entries.MEAN), chosen(entries.COUNT)
         self._happened, self._last = chosen(entries.EVER), chosen(entries.LAST, entries.LAST_COUNT)
+        self._recent = chosen(entries.RECENT)
         (episodes,), device = frame.batch_size, frame.device
         self._length = torch.zeros((episodes, 1), dtype=torch.int64, device=device)
         self._sums = torch.zeros((episodes, len(self._summed)), dtype=torch.float64, device=device)
@@ -169,6 +171,7 @@ class _Tally:
         self._counts = torch.zeros((episodes, len(self._counted)), dtype=torch.int64, device=device)
         self._ever = torch.zeros((episodes, len(self._happened)), dtype=torch.bool, device=device)
         self._ends = torch.zeros((episodes, len(self._last)), dtype=torch.float64, device=device)
+        self._means: Tensor | None = None  # of the recent past, (episodes, columns)
 
     def add(self, frame: TensorDictBase, alive: Tensor) -> None:
         """Add a step of the episodes in ``alive``, ``(episodes,)``."""
@@ -182,6 +185,11 @@ class _Tally:
             self._ever |= going & _side_by_side(frame, self._happened)
         if self._last:
             self._ends = torch.where(going, _side_by_side(frame, self._last).double(), self._ends)
+        if self._recent:
+            now = _side_by_side(frame, self._recent).double()
+            self._means = (
+                now if self._means is None else torch.where(going, self._means.lerp(now, FORGOTTEN), self._means)
+            )
 
     def records(self, horizon: int | None) -> EpisodeRecords:
         """Give all that has been added, of episodes of at most ``horizon`` steps."""
@@ -192,6 +200,7 @@ class _Tally:
             (self._counted, self._counts),
             (self._happened, self._ever),
             (self._last, self._ends),
+            (self._recent, self._means if self._means is not None else self._sums[:, :0]),
         )
         for group, values in tallies:
             for column, value in zip(group, values.unbind(-1), strict=True):

@@ -9,6 +9,7 @@ import numpy as np
 from softgm_bench.episodes.evaluation import EpisodeRecords
 
 STEPS = (50, 100, 200, 400, 2000)  # control steps by which successes are counted, where episodes are as long
+MOTIONLESS = 1e-4  # m a control step; a tip that moves less at the end of a failed episode stands still
 RENAMED = {"length": "episode_length"}  # columns that summaries know by another name
 
 
@@ -17,6 +18,8 @@ def summarise(records: EpisodeRecords) -> dict[str, Any]:
 
     Of what happened or did not there is the success rate with its 95 % interval, and otherwise the number of episodes.
     ``success_by_step`` is the share of episodes that have succeeded by each of ``STEPS``, as far as the horizon goes.
+    ``motionless_failures`` are the episodes that did not succeed and at whose end the tip moved by less than
+    ``MOTIONLESS`` a step.
     """
     metrics: dict[str, Any] = {"episodes": records.episodes}
     numbers: dict[str, Any] = {}
@@ -29,6 +32,8 @@ def summarise(records: EpisodeRecords) -> dict[str, Any]:
             metrics[name] = int(values.sum())
         else:
             numbers[RENAMED.get(name, name)] = {"mean": float(np.mean(values)), "std": float(np.std(values))}
+    if "success" in records and "final_tip_step" in records:
+        metrics["motionless_failures"] = int((~records["success"] & (records["final_tip_step"] < MOTIONLESS)).sum())
     if "success" in records and (by_step := success_by_step(records, records.horizon)):
         metrics["success_by_step"] = by_step
     return metrics | numbers

@@ -50,6 +50,7 @@ __all__ = [  # with the views, so that models name one module
     "sense",
     "slot_channels",
     "slot_features",
+    "without_empty_slots",
 ]
 
 
@@ -131,8 +132,23 @@ def all_slots(td: TensorDictBase) -> Tensor:
     return obstacle_channels(descriptor, target, tip).reshape(shape)
 
 
+def without_empty_slots(td: TensorDictBase) -> TensorDictBase:
+    """Give the observation without the last slots, those that are active nowhere in the batch: slots fill in order.
+
+    Where that many are, is read from the tensors: not for devices that must not be waited for.
+    """
+    active = td[entries.SLOT_ACTIVE]
+    used = active.reshape(-1, active.shape[-1]).any(0).nonzero()
+    count = int(used[-1]) + 1 if len(used) else 0
+    cropped = td.select(entries.TIP, entries.TARGET)
+    cropped[entries.EDGE] = td[entries.EDGE][..., :count]
+    cropped[entries.SLOT_ACTIVE] = active[..., :count]
+    cropped[entries.SLOT_DESCRIPTOR] = td[entries.SLOT_DESCRIPTOR][..., :count, :]
+    return cropped
+
+
 class Sensed(NamedTuple):
-    """The K obstacle nodes that some agent hears, packed over the batch, and the E edges from them.
+    """The K obstacle nodes that some agent senses now, packed over the batch, and the E edges from them.
 
     Attributes:
         channels: features of the nodes, ``(K, 15)``.
@@ -147,9 +163,9 @@ class Sensed(NamedTuple):
     slot: Tensor
 
 
-def sense(td: TensorDictBase, discovered: bool = False) -> Sensed | None:
+def sense(td: TensorDictBase) -> Sensed | None:
     """Gather what the entity -> agent edges need; None if there is no edge. Leading dimensions are packed into B."""
-    edge = heard_slots(td, discovered)
+    edge = td[entries.EDGE]
     n_agents, n_slots = edge.shape[-2:]
     position = edge.reshape(-1).nonzero().squeeze(-1)
     if position.numel() == 0:

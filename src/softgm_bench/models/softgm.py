@@ -2,7 +2,8 @@
 
 Cheap by construction. Only obstacle slots with an edge to some agent are computed: slots hear nobody, so one without an
 edge cannot influence any agent. On a device that must not be waited for (``softgm_bench.rod.sync``) all slots are
-computed and masked instead, in shapes that no value decides on. Nothing between ``W_in`` and the first attention layer
+computed and masked instead, in shapes that no value decides on; and where every agent hears every discovered slot,
+which is too many edges for a list. Nothing between ``W_in`` and the first attention layer
 is nonlinear, so their matrices are multiplied first and ``h^(0)`` is never formed (unless a residual connection needs
 it). ``forward_dense`` is the paper's text, all nodes and masked, with the same parameters; the forms agree to rounding.
 
@@ -132,7 +133,8 @@ class SoftGMEncoder(Encoder):
         shape = td[entries.EDGE].shape[-2:]
         agents, pending = self._enter(channels.flatten(0, -2), graph.AGENT)  # packed: (B N, 15 or hidden)
         if len(self.stage1):
-            entity_stage = self._entity_stage if sync.is_free(channels.device) else self._slot_stage
+            packed = sync.is_free(channels.device) and not self.config.remember
+            entity_stage = self._entity_stage if packed else self._slot_stage
             agents = entity_stage(td, agents, pending, stage1)
             pending = None
         if len(self.stage2):
@@ -141,7 +143,7 @@ class SoftGMEncoder(Encoder):
 
     def _entity_stage(self, td: TensorDictBase, agents: Tensor, pending: Affine | None, record: Record) -> Tensor:
         """Stage 1: ``(B N, hidden)`` after L layers of entity -> agent messages."""
-        sensed = graph.sense(td, self.config.remember)
+        sensed = graph.sense(td)
         if sensed is not None:
             entities, entity_pending = self._enter(sensed.channels, graph.OBSTACLE)
         for depth, layer in enumerate(_layers(self.stage1), start=1):
@@ -163,10 +165,12 @@ class SoftGMEncoder(Encoder):
         return agents
 
     def _slot_stage(self, td: TensorDictBase, agents: Tensor, pending: Affine | None, record: Record) -> Tensor:
-        """Stage 1 as ``_entity_stage`` computes it, from all M slots.
+        """Stage 1 as ``_entity_stage`` computes it, from all M slots, or from those that are in use somewhere.
 
         ``W_in`` is absorbed with residual connections too: a slot hears only itself, so they are linear there as well.
         """
+        if record is None and sync.is_free(agents.device):
+            td = graph.without_empty_slots(td)
         absent = graph.absent_slots(td, self.config.remember)
         slots = graph.all_slots(td)  # (B, M, 15), later (B, M, hidden)
         slot_pending: Affine | None = self._input_of(graph.OBSTACLE)
