@@ -11,6 +11,7 @@ def test_another_model_than_an_algorithms_own_is_named_in_folder_and_label():
     for algo, model, name in (
         ("softgm", "softgm", "softgm"),
         ("softgm", "softgm_no_stage1", "softgm_no_stage1"),
+        ("softgm", "softgm_remember", "softgm_remember"),
         ("masac", "softgm_no_stage2", "masac_softgm_no_stage2"),
         ("softgm", "mlp", "softgm_mlp"),
         ("masac", "mlp", "masac"),

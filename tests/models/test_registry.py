@@ -18,7 +18,7 @@ from softgm_bench.models.registry import register_model
 def test_the_configuration_chooses_the_encoder():
     assert isinstance(build_encoder(softgm_config(), SIZES), SoftGMEncoder)
     assert isinstance(build_encoder(MLPConfig(hidden=8, layers=1, velocity_scale=1.0), SIZES), MLPEncoder)
-    softgm = dict.fromkeys(("softgm", "softgm_no_stage1", "softgm_no_stage2"), SoftGMConfig)
+    softgm = dict.fromkeys(("softgm", "softgm_no_stage1", "softgm_no_stage2", "softgm_remember"), SoftGMConfig)
     assert model_configs() == softgm | {"mlp": MLPConfig, "vector_mlp": VectorMLPConfig}
 
 

@@ -20,7 +20,7 @@ from softgm_bench.storage.run_folder import RunFolder
 TASKS = ("basic", "structured", "wall", "wall_narrow", "wall_fixed")
 ALGORITHMS = tuple(algorithm_configs())
 ON_POLICY = ("softgm", "ippo", "mappo")
-ABLATIONS = ("softgm_no_stage1", "softgm_no_stage2")  # models of SoftGM's algorithm
+ABLATIONS = ("softgm_no_stage1", "softgm_no_stage2", "softgm_remember")  # models of SoftGM's algorithm
 PAIRS = [*product(ALGORITHMS, ("mlp", "softgm")), *product(("softgm",), ABLATIONS)]
 OWN = {algo: "softgm" if algo == "softgm" else "mlp" for algo in ALGORITHMS}
 TINY = (

@@ -84,6 +84,13 @@ def test_named_grids_have_the_papers_cells_and_share_those_that_are_the_same(siz
     assert softgm == {cell.run_dir for cell in sweep.cells([f"+grids=table1{size}", "algo=softgm", "task=wall"])[0]}
 
 
+def test_the_ladder_goes_from_blind_to_told_and_shares_the_wholes_runs():
+    rungs = [str(cell.run_dir) for cell in sweep.cells(["+grids=ladder", "seed=1"])[0]]
+    assert rungs == [f"outputs/full/wall/{name}/seed1" for name in ("softgm_no_stage1", "softgm", "softgm_remember")]
+    told, _ = sweep.cells(["+grids=ladder", "seed=1", "model=softgm", "observation=oracle"])
+    assert [str(cell.run_dir) for cell in told] == ["outputs/full/wall/softgm_oracle/seed1"]
+
+
 def test_table_one_has_every_algorithm_task_and_seed():
     params = OmegaConf.load(config_directory() / "grids" / "table1.yaml").hydra.sweeper.params
     assert sorted(params.algo.split(",")) == ["iddpg", "ippo", "isac", "maddpg", "mappo", "masac", "softgm"]

@@ -21,6 +21,9 @@ def algorithm(label: str) -> str:
         if rest.startswith(f"no_stage{stage}"):
             name += f" without stage {stage}"
             rest = rest.removeprefix(f"no_stage{stage}").removeprefix("_")
+    if rest.startswith("remember"):
+        name += " that remembers"
+        rest = rest.removeprefix("remember").removeprefix("_")
     return f"{name}, {rest}" if rest else name
 
 

@@ -26,6 +26,7 @@ COLOURS = {
     "isac": "#e09fc6",
     "softgm_no_stage1": "#7b6fd0",
     "softgm_no_stage2": "#9c8412",
+    "softgm_remember": "#8c2d04",
 }
 DASHED = {"ippo", "iddpg", "isac"}
 OTHERS = ("#8a6d3b", "#6b7f2a", "#4a6f8a", "#8f5b5b", "#5f5f9e")

@@ -34,7 +34,7 @@ class SoftGMConfig:
     """Architecture of SoftGM. Values: ``conf/model/softgm.yaml``.
 
     Attributes:
-        name: of the file in ``conf/model``; the paper's ablations have names of their own.
+        name: of the file in ``conf/model``; the paper's ablations and SoftGM that remembers have names of their own.
         hidden: length of a node's embedding, over all heads (paper: 128).
         heads: attention heads; divides ``hidden`` (paper: 4).
         layers: L, attention layers in each stage (paper: 2).
@@ -73,7 +73,7 @@ class SoftGMConfig:
 Record = list[Tensor] | None  # where to leave the attention of each layer
 
 
-@register_model("softgm", "softgm_no_stage1", "softgm_no_stage2", config=SoftGMConfig)
+@register_model("softgm", "softgm_no_stage1", "softgm_no_stage2", "softgm_remember", config=SoftGMConfig)
 class SoftGMEncoder(Encoder):
     """Turns the observation into one embedding g_i per agent."""
 
