@@ -1,4 +1,4 @@
-"""Train and evaluate: ``python -m softgm_bench algo=softgm task=wall seed=0``; with ``-m``, each cell of a grid."""
+"""The command line: ``softgm-bench COMMAND ...``; without a command's name, or as ``train``, a training or a sweep."""
 
 import os
 import runpy
@@ -14,28 +14,45 @@ from omegaconf import DictConfig
 from softgm_bench import process
 from softgm_bench.config import composing, config_directory, typed
 from softgm_bench.config.explain import USER_ERRORS, explain
+from softgm_bench.console import COMMANDS, HELP, VERSION, completions
 from softgm_bench.errors import UserError
 from softgm_bench.sweeps import cell as sweep_cell
 from softgm_bench.sweeps import launch as sweep
 
-COMMANDS = ("attention", "evaluate", "export", "render", "replay", "report", "status")
-
-
 def console() -> int:
-    """Run ``softgm-bench [COMMAND] ...``: one of ``COMMANDS``, ``train``, or without a name training too."""
-    name = sys.argv[1] if len(sys.argv) > 1 else ""
-    if name in COMMANDS:
-        del sys.argv[1]
-        runpy.run_module(f"softgm_bench.{name}", run_name="__main__", alter_sys=True)
+    """Run ``softgm-bench ...``; without anything, say what it can do."""
+    if len(sys.argv) == 1:
+        print(HELP, end="")
         return 0
-    if name == "train":
-        del sys.argv[1]
     return main()
 
 
 def main() -> int:
-    """Run what the command line says; 0 when all went well, 2 after a user's error, 128 + signal when interrupted."""
+    """Run what the command line says.
+
+    Returns:
+        0 when all went well, 2 after a user's error, 128 + signal when interrupted.
+    """
+    first, *others = sys.argv[1:] or [""]
+    if first in ("-h", "--help", "help") and not others:
+        print(HELP, end="")
+        return 0
+    if first == "--version":
+        print(VERSION)
+        return 0
+    if first in ("-sc", "--shell-completion") and not _complete():
+        return 0
+    if first in COMMANDS:
+        del sys.argv[1]
+        if first != "train":
+            runpy.run_module(f"softgm_bench.{first}", run_name="__main__", alter_sys=True)
+            return 0
+    return _train()
+
+
+def _train() -> int:
     process.prepare()
+    process.quieten()
     debugging = os.environ.get("HYDRA_FULL_ERROR") == "1"
     os.environ["HYDRA_FULL_ERROR"] = "1"  # let errors through instead of printing and leaving
     try:
@@ -52,6 +69,18 @@ def main() -> int:
         print(f"softgm_bench: {str(interruption) or 'interrupted; nothing was saved'}", file=sys.stderr)
         return getattr(interruption, "exit_code", 130)
     return 0
+
+
+def _complete() -> bool:
+    """Answer a shell that completes a command line; tell whether Hydra, which knows the settings, is to go on."""
+    line = os.environ.get("COMP_LINE")
+    if line is None or not sys.argv[-1].startswith("query="):
+        return True  # the shell asks for its script
+    words, rest = completions(line)
+    print(" ".join(words))
+    if rest is not None:
+        os.environ["COMP_LINE"] = rest
+    return rest is not None
 
 
 def _hydra(job: Any) -> None:

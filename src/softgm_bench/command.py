@@ -32,9 +32,10 @@ def run(name: str, text: str | None, body: Callable[[list[str]], None]) -> int:
         The exit status: 0; 2 after one line about what is wrong; 130 when interrupted.
     """
     process.prepare()
+    process.quieten()
     arguments = sys.argv[1:]
     if {"-h", "--help"} & set(arguments):
-        print((text or "").strip())
+        print((text or "").strip().replace("``", ""))
         return 0
     try:
         body(arguments)

@@ -1,4 +1,4 @@
-"""Keep a trained policy as one small file: ``python -m softgm_bench.export SOURCE FILE``.
+"""Keep a trained policy as one small file: ``softgm-bench export SOURCE FILE``.
 
 SOURCE is a run folder, whose newest checkpoint is taken, or a checkpoint. FILE is written, or replaced.
 """

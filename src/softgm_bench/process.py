@@ -4,6 +4,8 @@ Entry points call ``prepare`` first: commands, and the package when it is asked 
 """
 
 import os
+import sys
+import warnings
 
 SETTINGS = {
     # Idle OpenMP threads of torch spin for milliseconds by default, which slows processes that share cores (a sweep,
@@ -21,3 +23,12 @@ def prepare() -> None:
     for name, value in SETTINGS.items():
         if not (name == "GOMP_SPINCOUNT" and "OMP_WAIT_POLICY" in os.environ):
             os.environ.setdefault(name, value)
+
+
+def quieten() -> None:
+    """Keep warnings of libraries from users of a command, who can do nothing about them.
+
+    ``python -W default`` or ``PYTHONWARNINGS`` shows them; the Python interface leaves them alone.
+    """
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")

@@ -1,4 +1,4 @@
-"""Show what has become of a sweep: ``python -m softgm_bench.status FOLDER key=value ...``.
+"""Show what has become of a sweep: ``softgm-bench status FOLDER key=value ...``.
 
 FOLDER is where runs lie, such as outputs or outputs/full. Settings, with their defaults:
 

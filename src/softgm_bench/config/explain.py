@@ -28,6 +28,9 @@ def explain(error: Exception, overrides: list[str]) -> str:
         return f"{cause.full_key}: {_first_line(cause)}" if cause.full_key else _first_line(cause)
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    if ambiguous := re.match(r"Ambiguous value for argument '(([^'=]*)=([^']*))'", _first_line(error)):
+        setting, key, values = ambiguous.groups()
+        return f"{setting}: several values; add -m for a sweep, a run for each, or write a list as {key}=[{values}]"
     if type(error).__name__ == "OverrideParseException":
         return f"{_first_line(error)}: settings are written key=value"
     return _first_line(error)

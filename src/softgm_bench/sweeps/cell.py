@@ -193,6 +193,7 @@ def _leave(number: int, run_dir: str, overrides: list[str], outcome: Mapping[str
 def main() -> int:
     """Train the job on standard input; the last line on standard output says what came of it."""
     process.prepare()
+    process.quieten()
     job = json.loads(sys.stdin.read())
     _stop_with(job["parent"])
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "w")
