@@ -1,4 +1,4 @@
-"""Draw where a policy looks: ``python -m softgm_bench.attention SOURCE [key=value ...]``.
+"""Draw where a policy looks: ``softgm-bench attention SOURCE [key=value ...]``.
 
 SOURCE is a run folder, a checkpoint or a policy's file, of which an episode is recorded, or an episode that was
 recorded with attention (.npz). The encoder must have attention, as SoftGM's has.
@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING
 from softgm_bench import command
 from softgm_bench.config import available_threads
 from softgm_bench.errors import UserError
+from softgm_bench.progress import Progress, tracked
 
 if TYPE_CHECKING:
     from softgm_bench.episodes.trajectory import Trajectory
@@ -89,15 +90,17 @@ def _episode(source: Path, options: Options, overrides: list[str]) -> "Trajector
     if attention_encoder(trained.policy) is None:
         raise UserError(f"{source}: its model has no attention; name a policy that was trained with model=softgm")
     set_threads(options.threads)  # as an evaluation does: rounding depends on it
-    return record(
-        trained,
-        options.seed,
-        options.episode,
-        options.horizon,
-        options.deterministic,
-        attention=True,
-        episodes=options.episodes,
-    )
+    with Progress("recording", None, "steps") as progress:
+        return record(
+            trained,
+            options.seed,
+            options.episode,
+            options.horizon,
+            options.deterministic,
+            attention=True,
+            episodes=options.episodes,
+            watch=progress.advance,
+        )
 
 
 def _default_folder(source: Path, trajectory: "Trajectory", overrides: list[str]) -> Path:
@@ -124,7 +127,7 @@ def _write(trajectory: "Trajectory", steps: list[int] | None, folder: Path) -> l
     content = io.BytesIO()
     np.savez_compressed(content, **attention.arrays(trajectory))  # type: ignore[arg-type]
     files = {"attention.npz": content.getvalue(), "overview.png": attention.png(attention.draw_overview(trajectory))}
-    for step in chosen:
+    for step in tracked(chosen, "drawing", len(chosen), "steps"):
         for heads in (False, True):
             name = f"step{step:04d}{'_heads' if heads else ''}.png"
             files[name] = attention.png(attention.draw_step(trajectory, step, heads))

@@ -1,4 +1,4 @@
-"""Evaluate a trained policy: ``python -m softgm_bench.evaluate SOURCE key=value ...``.
+"""Evaluate a trained policy: ``softgm-bench evaluate SOURCE key=value ...``.
 
 SOURCE is a run folder (its newest checkpoint), a checkpoint or a policy's file. Settings, with their defaults:
 
@@ -25,15 +25,22 @@ Any other setting changes what the policy acts in:
   perturbation.tip_force=30      any single setting of it
 """
 
+import math
 import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from softgm_bench import command
 from softgm_bench.config import available_threads
 from softgm_bench.episodes.protocol import Protocol
 from softgm_bench.errors import UserError
+from softgm_bench.progress import Progress
+
+if TYPE_CHECKING:
+    from softgm_bench.episodes.evaluation import EpisodeRecords
+    from softgm_bench.episodes.policy import TrainedPolicy
 
 
 @dataclass
@@ -79,22 +86,37 @@ def _evaluate(arguments: list[str]) -> None:
     intervention = None if options.intervention == "none" else options.intervention
     unusual = {"horizon": options.horizon, "intervention": intervention, "sampled": not options.deterministic}
     folder = Path(options.out or evaluation_folder.default_folder(source, trained, overrides, options.seed, unusual))
+    under = trained.config.perturbation.name
+    shown = f", intervention {intervention}" if intervention else ""
+    title = f"{trained.label} on {trained.config.task.name}, perturbation {under}{shown}, seed {options.seed}:"
+    if not options.overwrite:
+        held = evaluation_folder.same(folder, trained, options.episodes, options.describe(trained, overrides))
+        if held is not None:
+            print(table(held["metrics"], title))
+            print(f"evaluated before, in {folder}; overwrite=true plays again")
+            return
     evaluation_folder.check(folder, options.overwrite)
     set_threads(options.threads)
     keep_memory()
     began = time.perf_counter()
-    records = options.play(trained)
+    records = _play(options, trained)
     seconds = time.perf_counter() - began
     summary = evaluation_folder.describe(trained, records, options.describe(trained, overrides))
-    under = trained.config.perturbation.name
-    shown = f", intervention {intervention}" if intervention else ""
-    title = f"{trained.label} on {summary['task']}, perturbation {under}{shown}, seed {options.seed}:"
     print(table(summary["metrics"], title), flush=True)  # before anything is written: a full disk leaves it
     try:
         evaluation_folder.write(folder, records, summary)
     except OSError as error:
         raise UserError(f"out={folder}: {error.strerror}; the table above is all that there is") from error
     print(f"{seconds:.1f} s; written to {folder}")
+
+
+def _play(options: Options, trained: "TrainedPolicy") -> "EpisodeRecords":
+    from softgm_bench.episodes.evaluation import watched
+
+    parts = math.ceil(options.episodes / (options.batch or options.episodes))
+    steps = parts * (options.horizon or trained.config.task.horizon)
+    with Progress("evaluating", steps, "steps", at_most=True) as progress:
+        return options.play(trained, watched(options.episodes, progress.advance))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Simulate a recorded episode again: ``python -m softgm_bench.replay TRAJECTORY.npz key=value ...``
+"""Simulate a recorded episode again: ``softgm-bench replay TRAJECTORY.npz key=value ...``
 
 The recorded actions, and forces if any, act on the arm among the recorded cylinders; no policy is asked.
 
@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from softgm_bench import command
 from softgm_bench.errors import UserError
+from softgm_bench.progress import Progress
 
 if TYPE_CHECKING:
     from softgm_bench.episodes.replay import Replay
@@ -45,7 +46,8 @@ def _replay(arguments: list[str]) -> None:
     recorded = trajectory.load(path)
     from softgm_bench.episodes import replay  # late: a refused file need not wait for torch
 
-    replayed = replay.replay(recorded, options.backend, options.pruning)
+    with Progress("replaying", recorded.steps, "steps") as progress:
+        replayed = replay.replay(recorded, options.backend, options.pruning, progress.advance)
     result = replay.compare(recorded, replayed)
     print("\n".join(report(recorded, replayed, result, options)))
     if options.out is not None:

@@ -1,4 +1,4 @@
-"""Make the paper's tables and figures from runs: ``python -m softgm_bench.report RUNS_FOLDER [key=value ...]``.
+"""Make the paper's tables and figures from runs: ``softgm-bench report RUNS_FOLDER [key=value ...]``.
 
 Writes ``report.md``, ``report.tex``, ``report.html`` (needs no other file), ``figures/`` for the first two,
 ``marl_eval.json`` and ``made_with.json``. The same runs give the same bytes.
@@ -17,6 +17,7 @@ from pathlib import Path
 
 from softgm_bench.command import parse, run
 from softgm_bench.errors import UserError
+from softgm_bench.progress import tracked
 from softgm_bench.storage.files import to_json, write_atomically
 
 
@@ -59,7 +60,11 @@ def report(arguments: list[str]) -> None:
 
     out = Path(options.out)
     (out / "figures").mkdir(parents=True, exist_ok=True)  # before the work whose result it takes
-    document = build(found, Bootstrap(options.resamples, options.seed))
+    document = build(
+        found,
+        Bootstrap(options.resamples, options.seed),
+        lambda titles: tracked(titles, "tables and figures", len(titles), "sections"),
+    )
     made_with = {"matplotlib": matplotlib.__version__, "resamples": options.resamples, "seed": options.seed}
     files = {
         "report.md": markdown.render(document).encode(),

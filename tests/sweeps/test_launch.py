@@ -144,8 +144,10 @@ def test_a_cell_that_leaves_no_word_is_not_taken_for_done(tmp_path, capsys):
         record = {"number": 1, "run_dir": "outputs/b", "overrides": [], "outcome": "done", "line": "success"}
         (plan.records / "000001.json").write_text(json.dumps(record))
     captured = capsys.readouterr()
-    assert captured.out == "outputs/b: done, success\n"
-    assert captured.err == "softgm_bench: 1 of 2 cells did not come to an end\n"
+    assert captured.out == "[1 of 2] outputs/b: done, success\n"
+    first, last = captured.err.splitlines()
+    assert first == f"2 cells; softgm-bench status {tmp_path} tells of each"
+    assert last == "softgm_bench: 1 of 2 cells did not come to an end"
     assert not outcomes.all_well
     assert not plan.records.exists()
 

@@ -1,7 +1,7 @@
 """Puts a report together from what was found."""
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 from softgm_bench.analysis import aggregate, figures, interventions, names, paper, tables
 from softgm_bench.analysis.document import Block, Document, Section
@@ -9,6 +9,8 @@ from softgm_bench.analysis.pools import Pools, by_algorithm, by_condition, newes
 from softgm_bench.analysis.runs import Found, Run
 from softgm_bench.analysis.statistics import Bootstrap
 from softgm_bench.analysis.style import look
+
+Track = Callable[[Sequence[str]], Iterable[str]]
 
 TITLE = "Report of softgm_bench"
 ONE_SEED = (
@@ -24,25 +26,32 @@ TORQUE = (
 
 
 @look()
-def build(found: Found, bootstrap: Bootstrap) -> Document:
-    """Build the whole report; the same input gives the same document."""
+def build(found: Found, bootstrap: Bootstrap, track: Track | None = None) -> Document:
+    """Build the whole report; the same input gives the same document. ``track`` goes through its sections."""
     runs, replaced = newest(found.runs)
     grouped, pools = by_algorithm(runs), pool_runs(runs)
-    sections: dict[str, Iterable[Block | None]] = {
-        "What was found": _summary(found, runs),
-        "Comparison with the paper": _comparison(pools, bootstrap),
-        "Robustness": _robustness(found, pools, bootstrap),
-        "Learning curves": [_curves(grouped) or "Not run."],
-        "Ablations": [tables.ablations(pools, bootstrap), _ablations(grouped)],
-        "Over all tasks": _over_tasks(pools, bootstrap),
-        "Sources": [
+    sections: dict[str, Callable[[], Iterable[Block | None]]] = {
+        "What was found": lambda: _summary(found, runs),
+        "Comparison with the paper": lambda: _comparison(pools, bootstrap),
+        "Robustness": lambda: _robustness(found, pools, bootstrap),
+        "Learning curves": lambda: [_curves(grouped) or "Not run."],
+        "Ablations": lambda: [tables.ablations(pools, bootstrap), _ablations(grouped)],
+        "Over all tasks": lambda: _over_tasks(pools, bootstrap),
+        "Sources": lambda: [
             tables.sources(runs),
             tables.evaluation_sources(found.evaluations) if found.evaluations else None,
             tables.left_out(found.problems, replaced) if found.problems or replaced else None,
         ],
-        "How the numbers are made": _method(bootstrap),
+        "How the numbers are made": lambda: _method(bootstrap),
     }
-    return Document(TITLE, [Section(title, [one for one in blocks if one]) for title, blocks in sections.items()])
+    titles = list(sections)
+    return Document(
+        TITLE,
+        [
+            Section(title, [one for one in sections[title]() if one])
+            for title in (titles if track is None else track(titles))
+        ],
+    )
 
 
 def _summary(found: Found, runs: Sequence[Run]) -> list[Block | None]:

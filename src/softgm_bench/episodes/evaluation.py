@@ -65,6 +65,7 @@ class EpisodeRecords(Mapping[str, Values]):
 
 
 Show = Callable[[TensorDictBase], TensorDictBase]
+Watch = Callable[[int, int], None]  # told now and then: steps and ended episodes since it was told last
 
 
 def evaluate(
@@ -75,10 +76,11 @@ def evaluate(
     seed: int,
     gamma: float = DISCOUNT,
     show: Show | None = None,
+    watch: Watch | None = None,
 ) -> EpisodeRecords:
     """One episode in each of ``env``'s environments; the same seed gives the same episodes.
 
-    ``show`` makes of a frame ``(episodes,)`` the one that the policy is shown in its place.
+    ``show`` makes of a frame ``(episodes,)`` the one that the policy is shown in its place; ``watch`` follows.
 
     Training is not disturbed: ``env`` must not be the training environment, and the global generator, on which a
     policy that samples draws, is put back.
@@ -88,7 +90,7 @@ def evaluate(
     with torch.random.fork_rng(devices), torch.no_grad(), set_exploration_type(exploration):
         env.set_seed(seed)
         torch.manual_seed(seed)
-        return _first_episodes(policy, env, gamma, show)
+        return _first_episodes(policy, env, gamma, show, watch)
 
 
 def evaluate_in_parts(
@@ -101,6 +103,7 @@ def evaluate_in_parts(
     gamma: float = DISCOUNT,
     at_once: int | None = None,
     show: Show | None = None,
+    watch: Watch | None = None,
 ) -> EpisodeRecords:
     """``episodes`` episodes; with the same ``at_once``, the same seed gives the same ones.
 
@@ -113,15 +116,28 @@ def evaluate_in_parts(
         gamma: of the discounted return.
         at_once: environments simulated side by side, to save memory; None: all.
         show: as ``evaluate`` takes it.
+        watch: likewise.
     """
     size = at_once or episodes
     parts = []
     for part, first in enumerate(range(0, episodes, size)):
         own = evaluation_seed(seed, part)
         env = build(min(size, episodes - first), own)
-        parts.append(evaluate(policy, env, deterministic=deterministic, seed=own, gamma=gamma, show=show))
+        parts.append(evaluate(policy, env, deterministic=deterministic, seed=own, gamma=gamma, show=show, watch=watch))
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     return EpisodeRecords(columns, parts[0].horizon)
+
+
+def watched(episodes: int, tell: Callable[[int, str], None]) -> Watch:
+    """Make a ``Watch`` that tells the steps since it told last, and what has become of all episodes in words."""
+    ended = 0
+
+    def watch(steps: int, more: int) -> None:
+        nonlocal ended
+        ended += more
+        tell(steps, f"{ended} of {episodes} episodes have ended")
+
+    return watch
 
 
 def evaluation_seed(seed: int, part: int = 0) -> int:
@@ -129,14 +145,22 @@ def evaluation_seed(seed: int, part: int = 0) -> int:
     return int(np.random.SeedSequence(seed, spawn_key=(2, part)).generate_state(1)[0])
 
 
-def _first_episodes(policy: TensorDictModuleBase, env: EnvBase, gamma: float, show: Show | None) -> EpisodeRecords:
+def _first_episodes(
+    policy: TensorDictModuleBase, env: EnvBase, gamma: float, show: Show | None, watch: Watch | None
+) -> EpisodeRecords:
     data = env.reset()
     alive = torch.ones(env.batch_size, dtype=torch.bool, device=env.device)
     tally: _Tally | None = None
     free = sync.is_free(alive.device)
+    told, ended = 0, 0
     for step in itertools.count():
-        if (free or step % CHECK_EVERY == 0) and not alive.any():
-            break
+        if free or step % CHECK_EVERY == 0:
+            going = int(alive.sum())
+            if watch is not None and step:
+                watch(step - told, alive.numel() - going - ended)
+                told, ended = step, alive.numel() - going
+            if not going:
+                break
         data = env.step(act(policy, data if show is None else show(data), alive))
         after = data["next"]
         tally = tally or _Tally(after, gamma)

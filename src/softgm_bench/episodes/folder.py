@@ -2,6 +2,7 @@
 
 import csv
 import io
+import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from softgm_bench.config import GROUPS, plain
+from softgm_bench.episodes import policy
 from softgm_bench.episodes.evaluation import EpisodeRecords
 from softgm_bench.episodes.policy import TrainedPolicy
 from softgm_bench.episodes.summary import summarise
@@ -43,6 +45,22 @@ def default_folder(
     return Path("outputs") / "evaluations" / source.stem / name
 
 
+def same(folder: Path, trained: TrainedPolicy, episodes: int, settings: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Read the summary of an evaluation of the same policy with the same settings, if ``folder`` holds it.
+
+    Threads may differ, which changes no more than rounding. An evaluation that does not tell its policy's parameters,
+    of an earlier version, is none.
+    """
+    try:
+        held = json.loads(RunFolder(folder).summary.read_text())
+        wanted = json.loads(to_json(_about(trained, settings)))
+        known = {key: held.get(key) for key in wanted}
+        alike = known | {"threads": None} == wanted | {"threads": None} and held["metrics"]["episodes"] == episodes
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return None
+    return held if alike else None
+
+
 def check(folder: Path, overwrite: bool) -> None:
     """Refuse a folder that holds something already, before hours are spent on what would not be written.
 
@@ -62,6 +80,10 @@ def check(folder: Path, overwrite: bool) -> None:
 
 def describe(trained: TrainedPolicy, records: EpisodeRecords, settings: Mapping[str, Any]) -> dict[str, Any]:
     """Fill ``summary.json``: the policy, what it acted in, ``settings`` of the evaluation, and the metrics."""
+    return {**_about(trained, settings), "metrics": summarise(records), "versions": versions()}
+
+
+def _about(trained: TrainedPolicy, settings: Mapping[str, Any]) -> dict[str, Any]:
     run, config = trained.run, trained.config
     return {
         "task": config.task.name,
@@ -70,10 +92,9 @@ def describe(trained: TrainedPolicy, records: EpisodeRecords, settings: Mapping[
         "observation": run.observation,
         "seed": run.seed,
         "frames": trained.frames,
+        "policy": policy.fingerprint(trained),
         "perturbation": asdict(config.perturbation),
         **settings,
-        "metrics": summarise(records),
-        "versions": versions(),
     }
 
 

@@ -1,5 +1,6 @@
 """Trained policies: read from a run folder, a checkpoint or a file that holds the actor alone."""
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -100,6 +101,16 @@ def save(trained: TrainedPolicy, path: Path) -> None:
         "versions": trained.versions,
     }
     write_where_asked(path, archive.packed(state))
+
+
+def fingerprint(trained: TrainedPolicy) -> str:
+    """Name the parameters by 16 hexadecimal digits of their hash: two policies that have one name are one."""
+    digest = hashlib.sha256()
+    for name, value in sorted(trained.policy.state_dict().items()):
+        digest.update(name.encode())
+        if isinstance(value, torch.Tensor):
+            digest.update(value.contiguous().numpy(force=True).tobytes())
+    return digest.hexdigest()[:16]
 
 
 def _file(path: Path) -> Path:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from softgm_bench.errors import UserError
 
 if TYPE_CHECKING:  # a refused command need not wait for torch
-    from softgm_bench.episodes.evaluation import EpisodeRecords
+    from softgm_bench.episodes.evaluation import EpisodeRecords, Watch
     from softgm_bench.episodes.policy import TrainedPolicy
 
 
@@ -65,8 +65,8 @@ class Protocol:
 
         interventions.check_fits(self.intervention, trained)
 
-    def play(self, trained: TrainedPolicy) -> EpisodeRecords:
-        """Play the episodes in the environment that belongs to the policy."""
+    def play(self, trained: TrainedPolicy, watch: Watch | None = None) -> EpisodeRecords:
+        """Play the episodes in the environment that belongs to the policy; ``watch`` follows."""
         from softgm_bench.assembly import build_env
         from softgm_bench.episodes.evaluation import evaluate_in_parts
         from softgm_bench.episodes.interventions import INTERVENTIONS
@@ -80,6 +80,7 @@ class Protocol:
             gamma=self.gamma,
             at_once=self.batch,
             show=INTERVENTIONS[self.intervention],
+            watch=watch,
         )
 
     def describe(self, trained: TrainedPolicy, overrides: Sequence[str]) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Record one episode of an evaluation: play all of them until it has ended, and keep everything about that one."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -34,6 +34,7 @@ def record(
     deterministic: bool = True,
     attention: bool = False,
     episodes: int | None = None,
+    watch: Callable[[], None] | None = None,
 ) -> Trajectory:
     """An episode of an evaluation, bit by bit.
 
@@ -48,6 +49,7 @@ def record(
         deterministic: act by the mode of the policy, otherwise by a sample.
         attention: record the attention weights too, if the policy has an encoder with attention.
         episodes: of the evaluation, all at once; ``episode + 1`` by default. Another number gives another episode.
+        watch: called after each step.
 
     Raises:
         UserError: an argument makes no sense, or the task has no arm.
@@ -62,7 +64,7 @@ def record(
     with torch.random.fork_rng([]), torch.no_grad(), set_exploration_type(exploration):
         env.set_seed(own)
         torch.manual_seed(own)
-        recorder = _play(trained.policy, env, episode, attention_encoder(trained.policy) if attention else None)
+        recorder = _play(trained.policy, env, episode, attention_encoder(trained.policy) if attention else None, watch)
     info = {
         "label": trained.label,
         "task": config.task.name,
@@ -86,6 +88,7 @@ def record_or_load(
     attention: bool = False,
     episodes: int | None = None,
     overrides: Sequence[str] = (),
+    watch: Callable[[], None] | None = None,
 ) -> Trajectory:
     """The trajectory in an ``.npz`` file; or ``record`` with the policy of a run folder, checkpoint or policy's file.
 
@@ -98,7 +101,8 @@ def record_or_load(
         if overrides:
             raise UserError(f"{overrides[0]}: {path} is a recorded episode, which takes no settings; name a policy")
         return trajectory.load(path)
-    return record(policy.load(path, overrides=overrides), seed, episode, horizon, deterministic, attention, episodes)
+    trained = policy.load(path, overrides=overrides)
+    return record(trained, seed, episode, horizon, deterministic, attention, episodes, watch)
 
 
 def attention_encoder(policy: nn.Module) -> Any | None:
@@ -169,7 +173,9 @@ class _Recorder:
         return values[self.row].numpy(force=True).copy()
 
 
-def _play(module: nn.Module, env: SoftArmEnv, row: int, encoder: Any | None) -> _Recorder:
+def _play(
+    module: nn.Module, env: SoftArmEnv, row: int, encoder: Any | None, watch: Callable[[], None] | None
+) -> _Recorder:
     """One episode in every environment, as ``evaluation.evaluate`` has it, until that of ``row`` ends."""
     recorder = _Recorder(env, row)
     data = env.reset()
@@ -183,6 +189,8 @@ def _play(module: nn.Module, env: SoftArmEnv, row: int, encoder: Any | None) -> 
         recorder.step(data["next"])
         data = step_mdp(data)
         recorder.state(data)
+        if watch is not None:
+            watch()
     return recorder
 
 

@@ -40,13 +40,16 @@ class Replay:
     missed: int | None = None
 
 
-def replay(trajectory: Trajectory, backend: str, pruning: bool = False) -> Replay:
+def replay(
+    trajectory: Trajectory, backend: str, pruning: bool = False, watch: Callable[[], None] | None = None
+) -> Replay:
     """Simulate a trajectory's actions and forces from its first state.
 
     Args:
         trajectory: what was recorded.
         backend: one of ``BACKENDS``. PyElastica computes in float64, the others in the recording's type.
         pruning: PyElastica skips cylinders by its bounding boxes as it is shipped, which may miss contacts.
+        watch: called before each step.
 
     Raises:
         UserError: no such backend, one that cannot simulate this arm, or PyElastica is not installed.
@@ -55,7 +58,7 @@ def replay(trajectory: Trajectory, backend: str, pruning: bool = False) -> Repla
         raise UserError(f"backend={backend}: choose one of {', '.join(BACKENDS)}")
     if pruning and backend != "pyelastica":
         raise UserError(f"pruning=true: only backend=pyelastica has bounding boxes, not backend={backend}")
-    return _pyelastica(trajectory, pruning) if backend == "pyelastica" else _ours(trajectory, backend)
+    return _pyelastica(trajectory, pruning, watch) if backend == "pyelastica" else _ours(trajectory, backend, watch)
 
 
 def compare(trajectory: Trajectory, replayed: Replay) -> dict[str, Any]:
@@ -84,9 +87,9 @@ def _outcome(position: Array, target: Array, radius: float) -> dict[str, Any]:
     return {"final_distance": float(distance[-1]), "reached": int(reached[0]) + 1 if len(reached) else None}
 
 
-def _ours(trajectory: Trajectory, name: str) -> Replay:
+def _ours(trajectory: Trajectory, name: str, watch: Callable[[], None] | None) -> Replay:
     parameters, dtype = trajectory.rod, torch.from_numpy(trajectory.position).dtype
-    backend, couple, force = rod_backend.make_backend(name, parameters), _couple(trajectory, dtype), _force(trajectory)
+    backend, couple, force = rod_backend.make_backend(name, parameters), _couple(trajectory, dtype, watch), _force(trajectory)
     cylinders = _cylinders(trajectory, dtype)
     task = trajectory.config["task"]
     rest_length = torch.as_tensor(rod_constants(parameters).rest_length, dtype=dtype)
@@ -103,7 +106,7 @@ def _ours(trajectory: Trajectory, name: str) -> Replay:
     return Replay(**arrays)
 
 
-def _pyelastica(trajectory: Trajectory, pruning: bool) -> Replay:
+def _pyelastica(trajectory: Trajectory, pruning: bool, watch: Callable[[], None] | None) -> Replay:
     try:
         from softgm_bench.rod.pyelastica_oracle import Post, simulate
     except ImportError as error:
@@ -113,7 +116,7 @@ def _pyelastica(trajectory: Trajectory, pruning: bool) -> Replay:
         raise UserError(f"rod.contact_model={parameters.contact_model}: PyElastica has no such contact")
     if trajectory.diverged:
         raise UserError("backend=pyelastica: this episode's simulation broke in its last step, which has no state")
-    couple = _couple(trajectory, torch.float64)
+    couple = _couple(trajectory, torch.float64, watch)
     columns = (trajectory.cylinders[name].tolist() for name in Post._fields)
     posts = [Post(*row) for row in zip(*columns, strict=True)]
     history = simulate(
@@ -129,8 +132,10 @@ def _first(trajectory: Trajectory, name: str) -> torch.Tensor:
     return torch.from_numpy(getattr(trajectory, name)[:1].copy())
 
 
-def _couple(trajectory: Trajectory, dtype: torch.dtype) -> Callable[[int], torch.Tensor]:
-    """Couple on the elements in a step, N m, ``(1, 3, n_elements)``."""
+def _couple(
+    trajectory: Trajectory, dtype: torch.dtype, watch: Callable[[], None] | None
+) -> Callable[[int], torch.Tensor]:
+    """Couple on the elements in a step, N m, ``(1, 3, n_elements)``; it is asked for once a step, which is watched."""
     settings = trajectory.config["task"]["actuation"]
     actuation = Actuation(
         trajectory.rod,
@@ -140,7 +145,13 @@ def _couple(trajectory: Trajectory, dtype: torch.dtype) -> Callable[[int], torch
         settings["scaling"],
         dtype=dtype,
     )
-    return lambda step: actuation.couple(torch.from_numpy(trajectory.action[step : step + 1]))
+
+    def couple(step: int) -> torch.Tensor:
+        if watch is not None:
+            watch()
+        return actuation.couple(torch.from_numpy(trajectory.action[step : step + 1]))
+
+    return couple
 
 
 def _force(trajectory: Trajectory) -> Callable[[int], NDArray[np.float64]] | None:

@@ -13,6 +13,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from softgm_bench import compilation
+
+compilation.watch()
+
 NEIGHBOURS = 3  # the previous agent, the agent itself, the next one
 FAST = {"reassoc", "contract", "nsz"}  # sums may be reordered: LLVM vectorises them then
 

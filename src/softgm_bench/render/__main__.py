@@ -1,4 +1,4 @@
-"""Draw one episode: ``python -m softgm_bench.render SOURCE out=FILE[,FILE...] [key=value ...]``.
+"""Draw one episode: ``softgm-bench render SOURCE out=FILE[,FILE...] [key=value ...]``.
 
 SOURCE is a run folder, a checkpoint or a policy's file, of which an episode is recorded, or a recorded episode (.npz).
 The end of each FILE's name says what it is: .png a still, .mp4, .webp or .gif a video, .html an interactive page.
@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Any
 
 from softgm_bench import command
 from softgm_bench.errors import UserError
+from softgm_bench.progress import Progress, tracked
 
 if TYPE_CHECKING:
     from softgm_bench.episodes.trajectory import Trajectory
@@ -80,7 +81,11 @@ def main(arguments: list[str]) -> None:
     if source.suffix == ".npz" and chosen:
         raise UserError(f"{min(chosen)}: {source} is recorded already; name a policy to record another episode")
     page = any(file.suffix == ".html" for file in files)
-    trajectory = recording.record_or_load(source, attention=options.attention or page, overrides=overrides, **chosen)
+    with Progress("recording", None, "steps") as progress:
+        seen = options.attention or page
+        trajectory = recording.record_or_load(
+            source, attention=seen, overrides=overrides, watch=progress.advance, **chosen
+        )
     if options.step is not None and options.step > trajectory.steps:
         raise UserError(f"step is {options.step:g}: this episode has steps 0 to {trajectory.steps}")
     if options.attention and not trajectory.attention:
@@ -137,7 +142,7 @@ def _write(trajectory: "Trajectory", options: Options, file: Path) -> None:
     control_dt = studio.stage.control_dt
     speed = options.speed or video.natural_speed(trajectory.steps * control_dt)
     times = video.moments(trajectory.steps, control_dt, options.fps, speed)
-    frames = video.pictures(studio, times, speed, options.threads)
+    frames = tracked(video.pictures(studio, times, speed, options.threads), f"drawing {file}", len(times), "frames")
     mp4 = file.suffix == ".mp4"
     write_where_asked(
         file, video.mp4(frames, options.fps) if mp4 else video.animated(frames, options.fps, file.suffix[1:])

@@ -6,6 +6,10 @@ from typing import Any
 
 import numba
 
+from softgm_bench import compilation
+
+compilation.watch()
+
 MISS = 1e30
 # Nothing here computes with infinities or NaN on purpose, but a ray along an axis divides by zero and is caught after.
 FASTMATH = {"contract", "reassoc", "nsz", "arcp"}

@@ -17,9 +17,12 @@ import numpy as np
 from llvmlite import ir
 from numba.extending import intrinsic
 
+from softgm_bench import compilation
 from softgm_bench.rod.callees import with_callees
 from softgm_bench.rod.numba_layout import Layout, make_layout
 from softgm_bench.rod.series import SMALL_BEND, SMALL_EXPONENT, SMALL_TURN, TINY, bend, cosc, exponential, sinc
+
+compilation.watch()
 
 # No NaN test happens inside the kernel, so "nnan" is safe; infinities keep their IEEE meaning.
 FASTMATH = {"contract", "reassoc", "nsz", "nnan", "arcp"}

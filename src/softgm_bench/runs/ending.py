@@ -12,7 +12,7 @@ import torch
 from softgm_bench.assembly import build_env
 from softgm_bench.config import plain
 from softgm_bench.config.checks import device_type
-from softgm_bench.episodes.evaluation import DISCOUNT, EpisodeRecords, evaluate
+from softgm_bench.episodes.evaluation import DISCOUNT, EpisodeRecords, Watch, evaluate
 from softgm_bench.episodes.summary import summarise
 from softgm_bench.runs import checkpoint
 from softgm_bench.runs.metrics import CsvWriter
@@ -25,12 +25,12 @@ REHEARSAL = ".rehearsal"  # in the run folder, while the end is tried
 TIMED_STEPS = 8  # control steps by which the final evaluation's duration is foretold
 
 
-def play(run: Run, episodes: int, seed: int, horizon: int | None) -> EpisodeRecords:
-    """Evaluate the policy; the run's budget learns what it took."""
+def play(run: Run, episodes: int, seed: int, horizon: int | None, watch: Watch | None = None) -> EpisodeRecords:
+    """Evaluate the policy while ``watch`` follows; the run's budget learns what it took."""
     began = time.perf_counter()
     env = build_env(run.config, episodes, seed, horizon)
     settings = run.config.experiment.evaluation
-    records = evaluate(run.algorithm.policy, env, deterministic=settings.deterministic, seed=seed)
+    records = evaluate(run.algorithm.policy, env, deterministic=settings.deterministic, seed=seed, watch=watch)
     # a GPU takes as long for few environments as for many, as long as launches are what takes time
     size = settings.final_episodes / episodes if device_type(run.config.device) == "cpu" else 1.0
     run.budget.measured((time.perf_counter() - began) * max(1.0, size), int(records["length"].max()))

@@ -68,7 +68,8 @@ def _go(run: Run) -> EpisodeRecords:
             progress.say(f"final evaluation: {settings.final_episodes} episodes")
             with interruption.at_once():
                 seed = run.seeds.final_evaluation
-                return ending.play(run, settings.final_episodes, seed, settings.final_horizon)
+                watch = progress.evaluation(settings.final_episodes)
+                return ending.play(run, settings.final_episodes, seed, settings.final_horizon, watch)
         except Interrupted as stop:
             stop.args = (f"interrupted after {run.frames} frames, resume=true resumes it; checkpoint: {_save(run)}",)
             raise
@@ -167,7 +168,8 @@ def _evaluate_if_due(run: Run, interruption: Interruption, progress: Progress) -
         return
     with interruption.at_once():
         settings = run.config.experiment.evaluation
-        records = ending.play(run, settings.episodes, run.seeds.evaluation, settings.horizon)
+        watch = progress.evaluation(settings.episodes)
+        records = ending.play(run, settings.episodes, run.seeds.evaluation, settings.horizon, watch)
     run.evaluations += 1
     metrics = summarise(records)
     at = {"evaluation": run.evaluations, "iteration": run.iteration, "frames": run.frames, "wall_time": run.wall_time}

@@ -139,6 +139,7 @@ def reported(plan: Plan) -> Iterator[Outcomes]:
     records = plan.records
     records.mkdir(parents=True, exist_ok=True)
     outcomes, stop = Outcomes(plan.jobs), threading.Event()
+    print(f"{plan.jobs} cells; softgm-bench status {_shown(records.parent)} tells of each", file=sys.stderr, flush=True)
 
     def watch() -> None:
         while not stop.wait(POLL):
@@ -156,11 +157,17 @@ def reported(plan: Plan) -> Iterator[Outcomes]:
         _print_failures(outcomes)
 
 
+def _shown(folder: Path) -> str:
+    """A folder as one would write it here."""
+    return os.path.relpath(folder) if folder.is_relative_to(Path.cwd()) else str(folder)
+
+
 def _print_new(records: Path, outcomes: Outcomes) -> None:
     for path in sorted(records.glob("[0-9]*.json")):
         if int(path.stem) not in outcomes.seen:
             record = outcomes.seen[int(path.stem)] = json.loads(path.read_text())
-            print(f"{_name(record)}: {record['outcome']}, {record['line']}", flush=True)
+            count = f"[{len(outcomes.seen)} of {outcomes.jobs}]"
+            print(f"{count} {_name(record)}: {record['outcome']}, {record['line']}", flush=True)
 
 
 def _print_failures(outcomes: Outcomes) -> None:

@@ -1,0 +1,56 @@
+"""Says when a kernel is being compiled, which is long and happens once on a machine, and knows how long that took.
+
+Numba tells of every compilation, but not of machine code that it finds on disk.
+"""
+
+import sys
+import time
+from contextlib import suppress
+from functools import cache
+
+from numba.core import event
+
+LINE = "compiling the kernels, once on this machine: up to a minute"
+
+
+class _Compilations(event.Listener):
+    """Adds up compilations; one that another asks for is part of it."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+        self._depth, self._began, self._told = 0, 0.0, False
+
+    def on_start(self, event: event.Event) -> None:
+        """Say so, the first time."""
+        if self._depth == 0:
+            self._began = time.perf_counter()
+            if not self._told:
+                self._told = True
+                _say(LINE)
+        self._depth += 1
+
+    def on_end(self, event: event.Event) -> None:
+        """Stop the clock with the outermost one."""
+        self._depth -= 1
+        if self._depth == 0:
+            self.seconds += time.perf_counter() - self._began
+
+
+_LISTENER = _Compilations()
+
+
+@cache
+def watch() -> None:
+    """Listen from now on; modules that compile call it."""
+    event.register("numba:compile", _LISTENER)
+
+
+def seconds() -> float:
+    """How long this process has compiled; for clocks that are not to count it."""
+    return _LISTENER.seconds
+
+
+def _say(line: str) -> None:
+    if sys.stderr is not None:
+        with suppress(OSError, ValueError):  # nobody reads it any more
+            print(f"softgm_bench: {line}", file=sys.stderr, flush=True)
