@@ -11,10 +11,10 @@ SCENES = (
     ("basic_softgm", ("basic.png",), ("seed=0",)),
     ("structured_softgm", ("structured.png",), ("seed=0",)),
     ("wall_softgm", ("wall.png",), ("seed=3",)),
-    ("wall_softgm", ("wall_attention.png",), ("seed=3", "attention=true", "step=30")),
+    ("wall_softgm", ("wall_attention.png",), ("seed=3", "attention=true", "step=30", "distance=1.9")),
     ("wall_softgm", ("wall_narrow.png",), ("task=wall_narrow", "seed=4")),
     ("wall_softgm", ("wall_fixed.png",), ("task=wall_fixed", "seed=8")),
-    ("wall_softgm", ("wall.mp4",), ("seed=3",)),
+    ("wall_softgm", ("wall.mp4", "wall.html"), ("seed=3",)),
     ("wall_softgm", ("wall.webp",), ("seed=3", "width=480", "height=360", "fps=20")),
 )
 

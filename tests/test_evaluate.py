@@ -165,6 +165,38 @@ def test_nothing_is_replaced_by_accident(run, tmp_path):
     assert (status, err) == (2, "softgm_bench.evaluate: out=run holds a training run: choose another folder\n")
 
 
+def test_repeating_a_finished_evaluation_shows_its_table_and_plays_nothing(run, monkeypatch, tmp_path):
+    _, first, _ = run(SOFTGM, *QUICK, "out=x")
+    before = (tmp_path / "x/summary.json").stat().st_mtime_ns
+    monkeypatch.setattr(evaluate.Options, "play", lambda *arguments: 1 / 0)
+    status, again, err = run(SOFTGM, *QUICK, "out=x")
+    assert (status, err) == (0, "")
+    assert again.splitlines()[:-1] == first.splitlines()[:-1]
+    assert again.splitlines()[-1] == "evaluated before, in x; overwrite=true plays again"
+    assert (tmp_path / "x/summary.json").stat().st_mtime_ns == before
+
+
+@pytest.mark.parametrize(
+    "other", [(MAPPO,), (SOFTGM, "episodes=4"), (SOFTGM, "horizon=5"), (SOFTGM, "perturbation=noise")]
+)
+def test_another_policy_or_setting_is_another_evaluation(run, other):
+    assert run(SOFTGM, *QUICK, "out=x")[0] == 0
+    status, out, err = run(*QUICK, *other, "out=x")
+    assert (status, out) == (2, "")
+    assert "holds an evaluation" in err
+
+
+def test_a_policy_with_other_parameters_has_another_fingerprint():
+    from softgm_bench.episodes import policy
+
+    trained = policy.load(Path(SOFTGM))
+    name = policy.fingerprint(trained)
+    assert name == policy.fingerprint(policy.load(Path(SOFTGM)))
+    with torch.no_grad():
+        next(iter(trained.policy.parameters())).view(-1)[0] += 1e-3
+    assert policy.fingerprint(trained) != name
+
+
 def test_on_a_full_disk_the_table_is_left(run, monkeypatch, tmp_path):
     def full(path, content):
         raise OSError(errno.ENOSPC, "No space left on device", str(path))

@@ -39,7 +39,7 @@ def test_every_layer_and_head_is_drawn(episode):
     for separately, count in ((False, layers), (True, layers * heads)):
         titles = [axes.get_title(loc="left") for axes in meshes(attention.draw_step(episode, 3, separately))]
         assert len(titles) == 2 * count
-        assert titles[-1] == (f"layer {layers}, head {heads}" if separately else f"layer {layers}")
+        assert titles[-1] == (f"layer {layers - 1}, head {heads - 1}" if separately else f"layer {layers - 1}")
 
 
 def test_a_matrix_shows_the_weights_of_agents_and_bins(episode):

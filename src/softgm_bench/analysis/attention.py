@@ -117,7 +117,7 @@ def draw_step(trajectory: Trajectory, step: int, heads: bool = False) -> Canvas:
             axes.set_yticks(np.arange(n) + 0.5, agents if left == LEFT else [""] * n)
             last = row == len(rows) - 1
             axes.set_xticks(np.arange(len(columns)) + 0.5, columns if last else [""] * len(columns), rotation=90)
-            part = f"layer {layer + 1}" + ("" if head is None else f", head {head + 1}")
+            part = f"layer {layer}" + ("" if head is None else f", head {head}")
             axes.set_title(part, fontsize=8, fontweight="normal", color=SOFT, pad=4)
     bar = min(1.4, len(rows) * pitch - LAYER_TITLE)
     _colour_bar(canvas, ScalarMappable(cmap=COLOURS), 1.0, right + 0.2, top - bar, 0.13, bar)

@@ -211,8 +211,8 @@ class Stage:
         nodes = self.nodes(step)[:, trajectory.agent_nodes]
         for agent, slot in zip(*np.nonzero(weight > FAINT), strict=True):
             part = min(1.0, float(np.sqrt(weight[agent, slot] / STRONG)))
-            row = parts.paint(style.linear(style.ATTENTION), 0.1 + 0.85 * part)
-            thin = (0.0025 + 0.0045 * part) * self.base_length
+            row = parts.paint(style.linear(style.ATTENTION), 0.3 + 0.7 * part)
+            thin = (0.004 + 0.008 * part) * self.base_length
             parts.add(round_cone(centre[slot], thin, nodes[:, agent], thin), row, MARK, shine=(0.7, 0.0))
 
 

@@ -188,7 +188,7 @@ function drawLabels(context, episode, rod, view) {
     if (metres <= 0) return;
     disc(context, x, y, 8, white, mixed(agentColour(agent, episode.agents), ink, 0.2), 2);
     context.fillStyle = css(ink);
-    context.fillText(String(agent + 1), x, y + 0.5);
+    context.fillText(String(agent), x, y + 0.5);
   });
 }
 

@@ -11,7 +11,7 @@ function makeMatrix(episode, state, changed) {
   by("attention").hidden = false;
   const options = (id, entries) => by(id).replaceChildren(...entries.map(([text, value]) => new Option(text, value)));
   const first = episode.attention[names[0]];
-  const numbered = (n, name) => count(n).map((k) => [`${name} ${k + 1}`, k]);
+  const numbered = (n, name) => count(n).map((k) => [`${name} ${k}`, k]);
   options("a-stage", [...(names.length > 1 ? [["both", ""]] : []), ...names.map((name) => [STAGES[name], name])]);
   options("a-layer", [["mean", ""], ...numbered(first.layers, "layer")]);
   options("a-head", [["mean", ""], ...numbered(first.heads, "head")]);
@@ -29,7 +29,7 @@ function makeMatrix(episode, state, changed) {
     const tables = stages.map((name) => table(episode, name, step, state.choice));
     paintTables(context, width, height, tables, episode, state.theme);
     const every = first.every > 1 ? `; kept for every ${first.every}th step` : "";
-    by("c-attention").textContent = `decision of step ${step - (step % first.every) + 1}${every}`;
+    by("c-attention").textContent = `decision at step ${step - (step % first.every)}${every}`;
   });
   by("p-matrix").style.height = `${clamp(18 * episode.agents, 84, 240) + 16}px`;
   return [plot];
@@ -61,7 +61,7 @@ function paintTables(context, width, height, tables, episode, theme) {
   for (let agent = 0; agent < agents; agent++) {
     const y = top + rows * (agents - 1 - agent);
     fill(css(agentColour(agent, agents)), left - 6, y + 1, 4, rows - 2);
-    if (rows > 9) write(String(agent + 1), 0, y + rows / 2);
+    if (rows > 9) write(String(agent), 0, y + rows / 2);
   }
   // no cell wider than 1.6 rows; the agents' square first, bins share the rest
   const square = tables.length > 1 ? Math.min(0.42 * room, agents * rows * 1.6) : room;
