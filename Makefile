@@ -11,6 +11,7 @@ $(STAMP): pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev]'
 	touch $@
+	@echo 'Set up. Now: source .venv/bin/activate, then softgm-bench --help'
 
 train: setup
 	$(BIN)/python -m softgm_bench algo=softgm task=basic seed=0 experiment=quick

@@ -26,16 +26,58 @@ def on_config(config: Any) -> Any:
     return config
 
 
+# What others may build on; the rest of the package may change without notice. Tests and examples of these pages import
+# nothing else.
+PUBLIC = {
+    "": ["softgm_bench", "api", "errors", "plugins", "config", "config.schema"],
+    "envs": [
+        "envs",
+        "envs.soft_arm",
+        "envs.interface",
+        "envs.entries",
+        "envs.tasks",
+        "envs.tasks.base",
+        "envs.perturbation",
+        "envs.reward",
+    ],
+    "rod": [
+        "rod.parameters",
+        "rod.state",
+        "rod.actuation",
+        "rod.backend",
+        "rod.numba_backend",
+        "rod.torch_backend",
+        "rod.cuda_backend",
+    ],
+    "models": ["models", "models.registry", "models.graph", "models.softgm", "models.mlp", "models.heads"],
+    "algorithms": ["algorithms", "algorithms.registry"],
+    "episodes": [
+        "episodes.policy",
+        "episodes.evaluation",
+        "episodes.interventions",
+        "episodes.summary",
+        "episodes.recording",
+        "episodes.trajectory",
+        "episodes.replay",
+    ],
+    "render": ["render.still", "render.video", "render.html"],
+    "adapters": ["adapters.pettingzoo", "adapters.gymnasium_vector"],
+}
+
+
 def _modules() -> list[str]:
-    """Public modules of the package by dotted name."""
-    names = []
-    for path in sorted(PACKAGE.rglob("*.py")):
-        parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
-        if parts[-1] == "__init__":
-            parts = parts[:-1]
-        if not any(part.startswith("_") for part in parts):
-            names.append(".".join(parts))
-    return sorted(names)
+    """Public modules of the package by dotted name, those that this checkout has."""
+    return [module for room in PUBLIC for module in _room(room)]
+
+
+def _room(room: str) -> list[str]:
+    names = [PACKAGE.name if name == PACKAGE.name else f"{PACKAGE.name}.{name}" for name in PUBLIC[room]]
+    return [name for name in names if _source(name).exists()]
+
+
+def _source(module: str) -> Path:
+    path = PACKAGE.parent.joinpath(*module.split("."))
+    return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
 
 
 def _page(module: str) -> str:
@@ -44,14 +86,10 @@ def _page(module: str) -> str:
 
 
 def _api_navigation() -> list[Any]:
-    """The package's own modules, then a section for each of its rooms."""
-    rooms: dict[str, list[Any]] = {}
-    for module in _modules():
-        room, _, rest = module.removeprefix(f"{PACKAGE.name}").removeprefix(".").partition(".")
-        is_room = (PACKAGE / room).is_dir() and room
-        rooms.setdefault(room if is_room else "", []).append({(rest or room or PACKAGE.name): _page(module)})
-    own = rooms.pop("")
-    return [*own, *({room: pages} for room, pages in rooms.items())]
+    """The package's own public modules, then a section for each of its rooms."""
+    pages = {room: [{module.rpartition(".")[2]: _page(module)} for module in _room(room)] for room in PUBLIC}
+    own = pages.pop("")
+    return [*own, *({room: of_room} for room, of_room in pages.items() if of_room)]
 
 
 def on_files(files: Files, config: Any) -> Files:

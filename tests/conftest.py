@@ -5,12 +5,16 @@ import os
 import pytest
 import torch
 
-from softgm_bench import process
+from softgm_bench import compilation, process, progress
 from softgm_bench.assembly import configure
 from softgm_bench.config import Config
 
 process.prepare()  # this process is an entry point too; nothing has multiplied yet
 torch.set_num_threads(1 if "PYTEST_XDIST_WORKER" in os.environ else 2)
+
+# a command's standard error does not depend on how busy the machine is, nor on what is compiled already
+progress.SECONDS_BETWEEN_LINES = float("inf")
+compilation.told()
 
 TASKS = ("basic", "structured", "wall", "wall_narrow", "wall_fixed")
 

@@ -1,3 +1,4 @@
+import json
 import os
 import re
 import shutil
@@ -27,9 +28,29 @@ def test_snippets_of_the_documentation_run(code):
 
 def test_the_committed_run_has_the_success_that_the_readme_states():
     readme = (ROOT / "README.md").read_text()
-    summary = (ROOT / "experiments/trained/basic/softgm/seed0/summary.json").read_text()
-    (stated,) = re.findall(r"success rate +([0-9.]+)  \[", readme)
-    assert f'"mean": {float(stated)}' in summary
+    ((stated, low, high),) = re.findall(r"^success rate +([0-9.]+)  \[([0-9.]+), ([0-9.]+)\]", readme, re.MULTILINE)
+    summary = json.loads((ROOT / "experiments/trained/basic/softgm/seed0/summary.json").read_text())
+    success = summary["final_evaluation"]["success_rate"]
+    assert [f"{success[key]:.3f}" for key in ("mean", "low", "high")] == [stated, low, high]
+
+
+def test_the_results_of_the_readme_are_those_of_the_committed_runs():
+    readme = (ROOT / "README.md").read_text().partition("## Results")[2].partition("\n## ")[0]
+    rows = re.findall(r"^\| (?:`(\w+)`[^|]*)?\| (\w+)[^|]* \| ([0-9.]+) \| \[([0-9.]+), ([0-9.]+)\] \|$", readme, re.MULTILINE)
+    assert len(rows) == 10
+    task = ""
+    for named, algorithm, *stated in rows:
+        task = named or task
+        summary = ROOT / "experiments/trained" / task / algorithm.lower() / "seed0/summary.json"
+        success = json.loads(summary.read_text())["final_evaluation"]["success_rate"]
+        assert [f"{success[key]:.3f}" for key in ("mean", "low", "high")] == stated, (task, algorithm)
+
+
+def test_the_readme_is_short_and_has_no_link_that_leads_nowhere():
+    readme = (ROOT / "README.md").read_text()
+    assert readme.count("\n") <= 120
+    for target in re.findall(r"\]\(([^)#]+)[^)]*\)", readme):
+        assert target.startswith(("https://", "../../actions/")) or (ROOT / target).exists(), target
 
 
 ROW = re.compile(r"^\| `([\w.]+)` \| ([^|]+?) \|", re.MULTILINE)
@@ -88,7 +109,7 @@ def test_the_site_builds_without_warnings(tmp_path):
 @pytest.mark.slow
 def test_the_site_is_refused_for_every_kind_of_mistake(tmp_path):
     """One checkout with all of them, so that it is built once."""
-    pages, module = tmp_path / "docs", tmp_path / "src/softgm_bench/wrong.py"
+    pages, module = tmp_path / "docs", tmp_path / "src/softgm_bench/api.py"
     pages.mkdir()
     module.parent.mkdir(parents=True)
     (module.parent / "__init__.py").touch()

@@ -14,6 +14,7 @@ from softgm_bench.progress import Progress, tracked
 def clock(monkeypatch):
     """Seconds that pass when the test says so."""
     now = [0.0]
+    monkeypatch.setattr(progress, "SECONDS_BETWEEN_LINES", 10.0)  # which conftest.py has made endless
     monkeypatch.setattr(progress.time, "perf_counter", lambda: now[0])
     return now
 
@@ -106,7 +107,6 @@ def test_nobody_who_reads_is_no_reason_to_stop(stream, monkeypatch):
 
 
 def test_a_compilation_is_told_once_and_measured(capsys, monkeypatch):
-    monkeypatch.setattr(compilation._LISTENER, "_told", True)  # the process's own, which kernels may have registered
     listener = compilation._Compilations()
     monkeypatch.setattr(compilation, "_LISTENER", listener)
     compilation.event.register("numba:compile", listener)

@@ -59,7 +59,7 @@ def _attention(arguments: list[str]) -> None:
     try:
         import matplotlib  # noqa: F401
     except ImportError as error:
-        raise UserError("figures need matplotlib: pip install 'softgm-bench[report]'") from error
+        raise UserError("figures need matplotlib: pip install '.[report]'") from error
     if source.suffix == ".npz":
         given = [argument for argument in arguments if argument.partition("=")[0] in RECORDING]
         if given:

@@ -18,14 +18,15 @@ class _Compilations(event.Listener):
 
     def __init__(self) -> None:
         self.seconds = 0.0
-        self._depth, self._began, self._told = 0, 0.0, False
+        self.told = False
+        self._depth, self._began = 0, 0.0
 
     def on_start(self, event: event.Event) -> None:
         """Say so, the first time."""
         if self._depth == 0:
             self._began = time.perf_counter()
-            if not self._told:
-                self._told = True
+            if not self.told:
+                self.told = True
                 _say(LINE)
         self._depth += 1
 
@@ -43,6 +44,11 @@ _LISTENER = _Compilations()
 def watch() -> None:
     """Listen from now on; modules that compile call it."""
     event.register("numba:compile", _LISTENER)
+
+
+def told() -> None:
+    """Say nothing about compilations any more."""
+    _LISTENER.told = True
 
 
 def seconds() -> float:

@@ -51,7 +51,7 @@ def report(arguments: list[str]) -> None:
     try:
         import matplotlib
     except ImportError as error:
-        raise UserError("a report needs matplotlib: pip install 'softgm-bench[report]'") from error
+        raise UserError("a report needs matplotlib: pip install '.[report]'") from error
     from softgm_bench.analysis import html, latex, markdown
     from softgm_bench.analysis.build import build
     from softgm_bench.analysis.marl_eval import export

@@ -99,4 +99,4 @@ def test_what_is_not_installed_is_named(monkeypatch, capsys, recorded):
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "av" else find(name))
     assert run(monkeypatch, recorded, "out=a.mp4") == 2
-    assert "pip install 'softgm-bench[render]'" in capsys.readouterr().err
+    assert "pip install '.[render]'" in capsys.readouterr().err

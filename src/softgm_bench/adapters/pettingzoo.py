@@ -94,7 +94,7 @@ class _Film:
         try:
             from softgm_bench.render.still import PictureSettings, Studio
         except ImportError as error:
-            raise ImportError("rendering is not installed: pip install 'softgm-bench[render]'") from error
+            raise ImportError("rendering is not installed: pip install '.[render]'") from error
         trajectory = self._trajectory()
         distance = VIEW_DISTANCE * self._arm.backend.parameters.base_length
         studio = Studio(trajectory, PictureSettings(WIDTH, HEIGHT, distance=distance))

@@ -255,7 +255,7 @@ def _make_scenario(name: str, num_envs: int, arguments: dict[str, Any]) -> Any:
     try:
         import vmas
     except ImportError as error:
-        raise ValueError(f"task=vmas_{name} needs VMAS: pip install 'softgm-bench[vmas]'") from error
+        raise ValueError(f"task=vmas_{name} needs VMAS: pip install '.[vmas]'") from error
     return vmas.make_env(name, num_envs=num_envs, device="cpu", **arguments).scenario
 
 

@@ -110,7 +110,7 @@ def _pyelastica(trajectory: Trajectory, pruning: bool, watch: Callable[[], None]
     try:
         from softgm_bench.rod.pyelastica_oracle import Post, simulate
     except ImportError as error:
-        raise UserError("backend=pyelastica needs PyElastica: pip install 'softgm-bench[pyelastica]'") from error
+        raise UserError("backend=pyelastica needs PyElastica: pip install '.[pyelastica]'") from error
     parameters = trajectory.rod
     if parameters.contact_model != "pyelastica" and len(trajectory.cylinders["start"]):
         raise UserError(f"rod.contact_model={parameters.contact_model}: PyElastica has no such contact")

@@ -118,7 +118,7 @@ def _check(options: Options, files: list[Path]) -> None:
         raise UserError(f"{options.save}: a trajectory's file ends in .npz")
     for module, needing in {"PIL": kinds - {".html"}, "av": kinds & {".mp4"}}.items():
         if needing and importlib.util.find_spec(module) is None:
-            raise UserError(f"{min(needing)}: {module} is not installed; pip install 'softgm-bench[render]'")
+            raise UserError(f"{min(needing)}: {module} is not installed; pip install '.[render]'")
 
 
 def _write(trajectory: "Trajectory", options: Options, file: Path) -> None:

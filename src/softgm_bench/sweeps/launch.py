@@ -86,7 +86,7 @@ def plan(overrides: Sequence[str], directory: str | None = None) -> Plan:
     given = list(overrides)
     chosen = next((one.partition("=")[2] for one in reversed(given) if one.startswith("hydra/launcher=")), None)
     if chosen in EXTRAS and not installed(chosen):
-        raise UserError(f"hydra/launcher={chosen}: not installed; pip install 'softgm-bench[{EXTRAS[chosen]}]'")
+        raise UserError(f"hydra/launcher={chosen}: not installed; pip install '.[{EXTRAS[chosen]}]'")
     if chosen is None and installed(JOBLIB):
         given.append(f"hydra/launcher={JOBLIB}")
         chosen = JOBLIB
