@@ -36,7 +36,9 @@ def test_the_committed_run_has_the_success_that_the_readme_states():
 
 def test_the_results_of_the_readme_are_those_of_the_committed_runs():
     readme = (ROOT / "README.md").read_text().partition("## Results")[2].partition("\n## ")[0]
-    rows = re.findall(r"^\| (?:`(\w+)`[^|]*)?\| (\w+)[^|]* \| ([0-9.]+) \| \[([0-9.]+), ([0-9.]+)\] \|$", readme, re.MULTILINE)
+    rows = re.findall(
+        r"^\| (?:`(\w+)`[^|]*)?\| (\w+)[^|]* \| ([0-9.]+) \| \[([0-9.]+), ([0-9.]+)\] \|$", readme, re.MULTILINE
+    )
     assert len(rows) == 10
     task = ""
     for named, algorithm, *stated in rows:

@@ -19,6 +19,7 @@ from softgm_bench.errors import UserError
 from softgm_bench.sweeps import cell as sweep_cell
 from softgm_bench.sweeps import launch as sweep
 
+
 def console() -> int:
     """Run ``softgm-bench ...``; without anything, say what it can do."""
     if len(sys.argv) == 1:

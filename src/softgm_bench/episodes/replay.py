@@ -89,7 +89,11 @@ def _outcome(position: Array, target: Array, radius: float) -> dict[str, Any]:
 
 def _ours(trajectory: Trajectory, name: str, watch: Callable[[], None] | None) -> Replay:
     parameters, dtype = trajectory.rod, torch.from_numpy(trajectory.position).dtype
-    backend, couple, force = rod_backend.make_backend(name, parameters), _couple(trajectory, dtype, watch), _force(trajectory)
+    backend, couple, force = (
+        rod_backend.make_backend(name, parameters),
+        _couple(trajectory, dtype, watch),
+        _force(trajectory),
+    )
     cylinders = _cylinders(trajectory, dtype)
     task = trajectory.config["task"]
     rest_length = torch.as_tensor(rod_constants(parameters).rest_length, dtype=dtype)
