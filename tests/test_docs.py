@@ -81,6 +81,22 @@ def test_the_tables_of_a_task_are_its_settings(task):
     assert tables[SHARED] | inherited | tables[task] == settings_of(task)
 
 
+def test_the_api_reference_has_what_pages_and_examples_import_and_no_private_room():
+    hooks = (ROOT / "docs/hooks.py").read_text()
+    (listed,) = re.findall(r"^PUBLIC = (\{.*?^\})", hooks, re.MULTILINE | re.DOTALL)
+    names = {name for room in eval(listed).values() for name in room}
+    pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.md"), *(ROOT / "examples").glob("*.py")]
+    text = "".join(page.read_text() for page in pages)
+    for module, imported in re.findall(r"^from softgm_bench(?:\.([\w.]+))? import ([\w, ]+)", text, re.MULTILINE):
+        for name in imported.split(", "):
+            inner = f"{module}.{name}".strip(".")
+            assert inner in names or (module or "softgm_bench") in names, inner
+    assert not [name for name in names if name.split(".")[0] in ("upstream", "storage", "runs", "sweeps", "analysis")]
+    for name in names - {"softgm_bench"}:
+        path = ROOT / "src/softgm_bench" / name.replace(".", "/")
+        assert path.with_suffix(".py").is_file() or path.is_dir(), name
+
+
 def site(root, target):
     """Build the site of a checkout the way `make docs` does."""
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--config-file", root / "mkdocs.yml"]

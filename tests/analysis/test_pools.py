@@ -66,6 +66,14 @@ def test_an_oracle_and_training_under_a_perturbation_are_marked_and_not_ranked(t
     }
 
 
+def test_a_run_of_smoke_size_is_never_ranked(tmp_path):
+    write_run(tmp_path, "wall", "mappo", 0)
+    write_run(tmp_path, "wall", "softgm", 0, frames=384)
+    pools = pools_of(tmp_path)
+    assert (pools["wall", "softgm"].marks, pools["wall", "softgm"].ranked) == ("¶", False)
+    assert (pools["wall", "mappo"].marks, pools["wall", "mappo"].ranked) == ("", True)
+
+
 def test_a_curriculum_is_ranked_only_where_all_had_one(tmp_path):
     write_run(tmp_path, "wall", "softgm", 0, curriculum=True)
     write_run(tmp_path, "wall", "softgm_oracle", 0, observation="oracle")

@@ -7,7 +7,14 @@ from torchrl.envs.utils import exploration_type
 
 from dense import force_dense
 from softgm_bench.envs import entries, make_env
-from softgm_bench.episodes.evaluation import EpisodeRecords, evaluate, evaluate_in_parts, evaluation_seed
+from softgm_bench.episodes.evaluation import (
+    CHECK_EVERY,
+    EpisodeRecords,
+    evaluate,
+    evaluate_in_parts,
+    evaluation_seed,
+    watched,
+)
 from softgm_bench.episodes.summary import STEPS, success_by_step, summarise, table, wilson_interval
 from softgm_bench.rod.parameters import RodParameters
 from softgm_bench.runs.loop import derive_seeds
@@ -60,6 +67,31 @@ def test_looking_only_now_and_then_whether_episodes_go_on_changes_no_record():
     expected = records()
     with force_dense():
         assert records() == expected
+
+
+@pytest.mark.parametrize("free", [True, False])
+def test_who_watches_is_told_of_every_step_and_every_end_and_changes_no_record(free, monkeypatch):
+    monkeypatch.setattr("softgm_bench.rod.sync.is_free", lambda device: free)
+    told = []
+    lengths = [3, 1, 7]
+    seen = evaluate(policy(), CountingEnv(lengths), deterministic=True, seed=0, watch=lambda *one: told.append(one))
+    steps, ended = np.array(told).T
+    assert steps.sum() == (max(lengths) if free else CHECK_EVERY)
+    assert ended.sum() == len(lengths)
+    if free:
+        assert ended.tolist() == [1, 0, 1, 0, 0, 0, 1]
+    alone = evaluate(policy(), CountingEnv(lengths), deterministic=True, seed=0)
+    assert all(np.array_equal(seen[name], alone[name]) for name in alone)
+
+
+def test_all_parts_of_an_evaluation_are_told_of_together():
+    told = []
+    watch = watched(5, lambda steps, words: told.append(words))
+    evaluate_in_parts(
+        policy(), lambda n, seed: CountingEnv([2] * n), 5, deterministic=True, seed=0, at_once=2, watch=watch
+    )
+    assert told[-1] == "5 of 5 episodes have ended"
+    assert "2 of 5 episodes have ended" in told
 
 
 @pytest.mark.parametrize(("deterministic", "expected"), [(True, "DETERMINISTIC"), (False, "RANDOM")])

@@ -36,6 +36,7 @@ SYMBOLS = {
     "†": r"$^{\dagger}$",
     "‡": r"$^{\ddagger}$",
     "§": r"$^{\mathsection}$",
+    "¶": r"$^{\mathparagraph}$",
     "√": r"$\surd$",
     "τ": r"$\tau$",
     "→": r"$\rightarrow$",

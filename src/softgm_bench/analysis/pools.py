@@ -9,12 +9,14 @@ from softgm_bench.analysis import paper
 from softgm_bench.analysis.runs import Evaluation, Run
 from softgm_bench.analysis.statistics import Array, Bootstrap, mean
 
-ORACLE, CURRICULUM, PERTURBED = "†", "‡", "§"
+ORACLE, CURRICULUM, PERTURBED, SMOKE = "†", "‡", "§", "¶"
 MARKS = {
     ORACLE: "actors were told what they would have to discover; whether they use it, interventions tell",
     CURRICULUM: "trained with easier scenes first; evaluated, as all are, on the task itself",
     PERTURBED: "trained and evaluated under a perturbation",
+    SMOKE: "of smoke size: every part of a training once, which teaches nothing",
 }
+UNRANKED = {ORACLE, PERTURBED, SMOKE}
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,21 +116,21 @@ def by_algorithm(runs: Sequence[Run]) -> dict[tuple[str, str], list[Run]]:
 def pool_runs(runs: Sequence[Run]) -> dict[tuple[str, str], Pool]:
     """Pool final evaluations by task and algorithm; algorithms that differ in kind have different names.
 
-    Ranked are runs without the oracle and trained without perturbation. Where some were trained with a curriculum and
+    Ranked are runs of more than smoke size, without the oracle and trained without perturbation. Where some were trained with a curriculum and
     others were not, those with it are not ranked.
     """
     pools = {}
     for key, members in by_algorithm(sorted(runs, key=lambda run: (run.final.seed, run.final.folder))).items():
         kinds = set().union(*map(_kinds, members))
         rivals = [_kinds(run) for run in runs if run.final.task == key[0]]
-        fair = all(CURRICULUM in rival for rival in rivals if not rival & {ORACLE, PERTURBED})
-        ranked = not kinds & {ORACLE, PERTURBED} and (CURRICULUM not in kinds or fair)
+        fair = all(CURRICULUM in rival for rival in rivals if not rival & UNRANKED)
+        ranked = not kinds & UNRANKED and (CURRICULUM not in kinds or fair)
         pools[key] = Pool(tuple(run.final for run in members), "".join(mark for mark in MARKS if mark in kinds), ranked)
     return pools
 
 
 def _kinds(run: Run) -> set[str]:
-    there = {ORACLE: run.oracle, CURRICULUM: run.curriculum, PERTURBED: run.trained_with != "none"}
+    there = {ORACLE: run.oracle, CURRICULUM: run.curriculum, PERTURBED: run.trained_with != "none", SMOKE: run.smoke}
     return {mark for mark, is_so in there.items() if is_so}
 
 

@@ -23,6 +23,7 @@ from softgm_bench.errors import UserError
 from softgm_bench.storage.run_folder import RunFolder
 
 Columns = Mapping[str, NDArray[np.float64]]
+SMOKE_FRAMES = 10_000  # a smoke run has 384
 TRUTH = {"True": 1.0, "False": 0.0, "": float("nan")}
 
 
@@ -89,6 +90,11 @@ class Run:
     def curriculum(self) -> bool:
         """Tell whether training began with easier scenes."""
         return bool(self.config["task"].get("curriculum", {}).get("enabled", False))
+
+    @property
+    def smoke(self) -> bool:
+        """Tell whether training was too short to learn anything, whatever its experiment is called."""
+        return self.config["experiment"].get("name") == "smoke" or self.final.frames < SMOKE_FRAMES
 
     @property
     def trained_with(self) -> str:
