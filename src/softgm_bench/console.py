@@ -13,6 +13,7 @@ COMMANDS = {
     "train": "one run, or with -m a grid of them",
     "evaluate": "how well a policy does, with intervals",
     "render": "a picture, a video or an interactive page of an episode",
+    "watch": "a run while it learns: its newest checkpoint plays",
     "attention": "where a policy looks, step by step",
     "replay": "a recorded episode again, in this simulator or in PyElastica",
     "report": "tables and figures of many runs",

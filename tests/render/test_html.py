@@ -273,7 +273,7 @@ def test_the_policy_admits_this_script_and_this_style_alone(episode):
 def test_every_part_of_the_viewer_is_used():
     of_three = {"three/LICENSE", "three/README.md"}
     found = {path.relative_to(VIEWER).as_posix() for path in VIEWER.rglob("*") if path.is_file()}
-    assert found == {*SCRIPTS, *of_three, "page.html", "style.css"}
+    assert found == {*SCRIPTS, *of_three, "page.html", "style.css", "watch.html"}
 
 
 def test_three_js_has_the_stated_version_and_stands_beside_its_licence():

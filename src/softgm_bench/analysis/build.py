@@ -131,7 +131,8 @@ def _method(bootstrap: Bootstrap) -> list[Block | None]:
     return [
         "Mean ± standard deviation: over all episodes of all seeds together (population). Success: mean over seeds of "
         "a seed's share of successful episodes; an episode that diverged is none. Ranks compare success rates on one "
-        "task; an oracle, training under a perturbation and runs of smoke size are never ranked, training with a curriculum only where "
+        "task; an oracle, training under a perturbation and runs of smoke size are never ranked, training with a "
+        "curriculum only where "
         "every ranked run had one.",
         f"Intervals cover 95 %. Over seeds: percentiles of a stratified bootstrap ({bootstrap.resamples:,} resamples, "
         f"seed {bootstrap.seed}), which draws runs with replacement within each task (Agarwal et al. 2021). Of a "

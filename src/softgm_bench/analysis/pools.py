@@ -116,8 +116,8 @@ def by_algorithm(runs: Sequence[Run]) -> dict[tuple[str, str], list[Run]]:
 def pool_runs(runs: Sequence[Run]) -> dict[tuple[str, str], Pool]:
     """Pool final evaluations by task and algorithm; algorithms that differ in kind have different names.
 
-    Ranked are runs of more than smoke size, without the oracle and trained without perturbation. Where some were trained with a curriculum and
-    others were not, those with it are not ranked.
+    Ranked are runs of more than smoke size, without the oracle and trained without perturbation. Where some were
+    trained with a curriculum and others were not, those with it are not ranked.
     """
     pools = {}
     for key, members in by_algorithm(sorted(runs, key=lambda run: (run.final.seed, run.final.folder))).items():
