@@ -10,7 +10,7 @@ from functools import cache
 
 from numba.core import event
 
-LINE = "compiling the kernels, once on this machine: up to a minute"
+LINE = "compiling kernels, once on this machine: up to a minute"
 
 
 class _Compilations(event.Listener):
