@@ -42,6 +42,7 @@ class Progress:
         self._compiled = compilation.seconds()
         self._started = self._printed = time.perf_counter()
         style: dict[str, Any] = {"dynamic_ncols": True, "leave": keep, "delay": 0.0 if keep else DELAY}
+        style["unit_scale"] = total is not None and total >= 10_000
         self._bar = tqdm(disable=True)
         if sys.stderr is not None:
             with suppress(OSError, ValueError):  # disable=None: unless it is a terminal
