@@ -3,6 +3,7 @@
 import csv
 import errno
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -69,6 +70,7 @@ def test_an_evaluation_leaves_its_episodes_and_a_summary_of_them(run, tmp_path):
     assert versions["torch"] == torch.__version__.partition("+")[0] or versions["torch"] == torch.__version__
     frames = summary.pop("frames")
     assert frames > 1_000_000
+    assert re.fullmatch("[0-9a-f]{16}", summary.pop("policy"))
     assert summary == {
         "task": "wall",
         "algo": "softgm",

@@ -68,5 +68,5 @@ def test_what_does_not_fit_is_refused_in_one_line(overrides, said):
 
 def test_without_vmas_one_line_says_how_to_get_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "vmas", None)  # an import then fails
-    with pytest.raises(UserError, match=r"needs VMAS: pip install 'softgm-bench\[vmas\]'"):
+    with pytest.raises(UserError, match=r"needs VMAS: pip install '\.\[vmas\]'"):
         configure(["recipe=paper", "task=vmas_navigation", "algo=mappo", "model=vector_mlp"])

@@ -56,7 +56,7 @@ def test_more_jobs_times_threads_than_cores_are_refused(eight_cores):
 
 def test_a_launcher_that_is_not_installed_is_named_with_its_extra(monkeypatch):
     monkeypatch.setattr(sweep, "installed", lambda launcher: False)
-    with pytest.raises(UserError, match=r"hydra/launcher=ray: not installed; pip install 'softgm-bench\[ray\]'"):
+    with pytest.raises(UserError, match=r"hydra/launcher=ray: not installed; pip install '\.\[ray\]'"):
         sweep.plan(["hydra/launcher=ray", "seed=0,1"])
 
 
