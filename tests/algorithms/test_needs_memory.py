@@ -2,9 +2,9 @@
 
 import pytest
 import torch
+from cue import DELAY, N_AGENTS, CueEnv
 from torchrl.envs.utils import check_env_specs
 
-from cue import DELAY, N_AGENTS, CueEnv
 from softgm_bench.algorithms import PPO
 from softgm_bench.envs import entries
 from softgm_bench.episodes.evaluation import evaluate
@@ -29,7 +29,9 @@ def learn(settings, iterations, *overrides):
     for _ in range(iterations):
         learner.update(next(batches))
     collector.shutdown()
-    return learner.policy, evaluate(learner.policy, CueEnv(256), deterministic=True, seed=1)["undiscounted_return"].mean()
+    return learner.policy, evaluate(learner.policy, CueEnv(256), deterministic=True, seed=1)[
+        "undiscounted_return"
+    ].mean()
 
 
 def test_the_task_is_an_environment_that_hands_memory_on():

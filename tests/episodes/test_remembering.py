@@ -48,7 +48,9 @@ class Clocked(TensorDictModuleBase):
         self.noted = []
 
     def forward(self, td):
-        before = td.get(entries.MEMORY, torch.zeros(*td.shape, 6, 1)).masked_fill(td[entries.IS_INIT].unsqueeze(-1), 0.0)
+        before = td.get(entries.MEMORY, torch.zeros(*td.shape, 6, 1)).masked_fill(
+            td[entries.IS_INIT].unsqueeze(-1), 0.0
+        )
         self.noted.append(before[:, 0, 0].tolist())
         td.set(entries.NEXT_MEMORY, before + 1.0)
         return td.set(entries.ACTION, torch.zeros(*td.shape, 6, 2))

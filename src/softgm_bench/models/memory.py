@@ -5,12 +5,11 @@ from its own inputs alone, so execution stays decentralised.
 """
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor, nn
-from torch.nn import functional
 
 from softgm_bench.envs import entries
 from softgm_bench.models.activation import tanh
@@ -78,7 +77,9 @@ class Memory(nn.Module):
             ValueError: more than two batch dimensions.
         """
         if inputs.ndim > 4:
-            raise ValueError(f"inputs have shape {tuple(inputs.shape)}: an actor with memory reads (B,) or (B, T) frames")
+            raise ValueError(
+                f"inputs have shape {tuple(inputs.shape)}: an actor with memory reads (B,) or (B, T) frames"
+            )
         begins = td.get(entries.IS_INIT).unsqueeze(-1)  # (..., 1, 1)
         state = td.get(entries.MEMORY, None)
         if state is None:
