@@ -108,6 +108,14 @@ def test_an_episode_that_is_recorded_is_that_of_the_evaluation(trained, determin
         )
 
 
+def test_attention_is_recorded_beside_a_memory(trained):
+    recorded = recording.record(trained, 1, horizon=3, attention=True)
+    with_attention = trained.config.algo.name == "softgm"
+    assert {stage: len(weights) for stage, weights in recorded.attention.items()} == (
+        {"stage1": 3, "stage2": 3} if with_attention else {}
+    )
+
+
 def test_a_rollout_a_loop_of_ones_own_and_a_kept_file_act_alike_and_remember(trained, tmp_path):
     frames = api.rollout(environment(trained), trained, steps=9)  # the horizon ends episodes within
     policy.save(trained, tmp_path / "kept.pt")
