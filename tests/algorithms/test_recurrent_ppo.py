@@ -1,4 +1,4 @@
-"""PPO with actors that remember: learns from sequences, scores them as they were collected."""
+"""PPO with recurrent actors: learns from sequences, scores them as they were collected."""
 
 import pytest
 import torch
