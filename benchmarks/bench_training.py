@@ -9,6 +9,7 @@ TorchRL's collector. Each figure is that of the fastest repetition.
 
 import argparse
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,15 +30,16 @@ PARTS = ("simulator", "policy", "update", "framework")
 FRAMES = 12_800  # at least so many between two looks at the clock, of PPO; a tenth of it off-policy
 
 
-def measure(algo: str, task: str, repetitions: int) -> dict[str, Any]:
-    """The fastest repetition: frames per second and each part's share."""
+def measure(algo: str, task: str, repetitions: int, settings: Sequence[str] = ()) -> dict[str, Any]:
+    """The fastest repetition, with further settings: frames per second and each part's share."""
     off_policy = algo in OFF_POLICY
     config = compose(
         [f"algo={algo}", f"task={task}", "recipe=tuned", "experiment=quick"]
         + (["algo.random_frames=0"] if off_policy else [])
+        + list(settings)
     )
-    settings = config.experiment
-    env = make_env(config.task, config.rod, settings.num_envs, 0, settings.train_horizon, stagger=True)
+    experiment = config.experiment
+    env = make_env(config.task, config.rod, experiment.num_envs, 0, experiment.train_horizon, stagger=True)
     algorithm = build_algorithm(config.algo, config.model, env)
     stopwatch = Stopwatch()
     for owner, name, part in (
@@ -46,7 +48,7 @@ def measure(algo: str, task: str, repetitions: int) -> dict[str, Any]:
         (algorithm, "update", "update"),
     ):
         stopwatch.watch(owner, name, part)
-    per_iteration = settings.num_envs * settings.steps_per_batch
+    per_iteration = experiment.num_envs * experiment.steps_per_batch
     iterations = max(1, (FRAMES // 10 if off_policy else FRAMES) // per_iteration)
     collector = Collector(
         env,
@@ -71,7 +73,7 @@ def measure(algo: str, task: str, repetitions: int) -> dict[str, Any]:
             shares["framework"] = round(1.0 - sum(shares.values()), 4)
             best = {"frames_per_s": round(rate, 1), "shares": shares}
     collector.shutdown()
-    return {"algo": algo, "task": task, "num_envs": settings.num_envs} | best
+    return {"algo": algo, "task": task, "num_envs": experiment.num_envs, "settings": list(settings)} | best
 
 
 def main() -> None:
@@ -80,6 +82,9 @@ def main() -> None:
     parser.add_argument("--repetitions", type=int, default=2)
     parser.add_argument("--algorithms", nargs="+", default=ALGORITHMS)
     parser.add_argument("--tasks", nargs="+", default=TASKS)
+    parser.add_argument(
+        "--settings", nargs="+", default=(), help="further ones, e.g. 'algo.actor.memory={cell:gru,size:128}'"
+    )
     parser.add_argument("--output", type=Path, default=Path("benchmarks/results/training.json"))
     options = parser.parse_args()
     threads = set_threads(options.threads)
@@ -90,7 +95,7 @@ def main() -> None:
     rows = []
     for algo in options.algorithms:
         for task in options.tasks:
-            row = measure(algo, task, options.repetitions)
+            row = measure(algo, task, options.repetitions, options.settings)
             shares = "".join(f"{100.0 * row['shares'][part]:>6.1f}" for part in PARTS)
             print(f"{algo:<12}{task:<12}{row['frames_per_s']:>10.0f}  {shares}", flush=True)
             rows.append(row)

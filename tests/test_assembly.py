@@ -1,10 +1,12 @@
 import pytest
 import torch
 
+from softgm_bench import assembly
 from softgm_bench.algorithms import algorithm_configs
 from softgm_bench.assembly import build_algorithm, build_env, build_policy, configure
 from softgm_bench.envs import Environment, SoftArmEnv, kind_of
 from softgm_bench.episodes import policy
+from softgm_bench.errors import UserError
 from softgm_bench.runs.loop import train
 from softgm_bench.storage import archive
 from softgm_bench.storage.run_folder import RunFolder
@@ -52,3 +54,11 @@ def test_a_checkpoint_of_before_it_held_a_policy_of_its_own_still_gives_one(tmp_
         assert old.sizes == new.sizes
         held = zip(old.policy.parameters(), new.policy.parameters(), strict=True)
         assert all(torch.equal(one, other) for one, other in held)
+
+
+def test_a_memory_needs_an_environment_that_hands_it_on(monkeypatch):
+    remembers = ["task=basic", "algo=mappo", "algo.actor.memory={cell:gru,size:8}"]
+    configure(remembers)
+    monkeypatch.setattr(assembly, "RememberingEnv", int)  # as if the environment were another kind's
+    with pytest.raises(UserError, match=r"^algo\.actor\.memory: task=basic hands no memory on [^\n]*$"):
+        configure(remembers)

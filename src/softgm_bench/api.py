@@ -106,10 +106,18 @@ def load(source: str | Path, *overrides: str, device: str = "cpu") -> TrainedPol
 def act(
     trained: TrainedPolicy | TensorDictModuleBase, observation: TensorDictBase, deterministic: bool = True
 ) -> Tensor:
-    """Actions ``(num_envs, N, 2)`` in [-1, 1] for what ``env.reset()`` or ``step_mdp(env.step(...))`` gave."""
+    """Actions ``(num_envs, N, 2)`` in [-1, 1] for what ``env.reset()`` or ``step_mdp(env.step(...))`` gave.
+
+    What a policy with memory has to remember is written into ``observation``, with which ``env.step`` takes it on.
+    """
     module = trained.policy if isinstance(trained, TrainedPolicy) else trained
+    remembers = entries.MEMORY in module.in_keys
+    optional = [entries.MEMORY] if remembers and observation.get(entries.MEMORY, None) is None else []
     with torch.no_grad(), set_exploration_type(_exploration(deterministic)):
-        return module(observation.select(*module.in_keys))[entries.ACTION]
+        chosen = module(observation.select(*(key for key in module.in_keys if key not in optional)))
+    if remembers:
+        observation.set(entries.NEXT_MEMORY, chosen.get(entries.NEXT_MEMORY))
+    return chosen[entries.ACTION]
 
 
 def rollout(

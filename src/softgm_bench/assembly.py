@@ -10,6 +10,7 @@ from softgm_bench.algorithms import Algorithm
 from softgm_bench.config import Config, compose, validate
 from softgm_bench.envs import Sizes, entries, kind_of
 from softgm_bench.envs.interface import VECTOR
+from softgm_bench.envs.remembering import RememberingEnv
 from softgm_bench.errors import UserError
 from softgm_bench.models import build_encoder
 
@@ -80,7 +81,11 @@ def check_by_building(config: Config) -> None:
         env = kind.build(config, 1, config.seed, None, True)
         observed = set(env.observation_spec.keys(True, True))
         if entries.PREVIOUS_ACTION not in observed:
-            _refuse_memory(config)
+            _refuse_previous_action(config)
+        if getattr(getattr(config.algo, "actor", None), "memory", None) and not isinstance(env, RememberingEnv):
+            raise ValueError(
+                f"algo.actor.memory: task={config.task.name} hands no memory on from step to step; it must be null"
+            )
         if env.sizes.layout == VECTOR and getattr(getattr(config.algo, "critic", None), "mlp", None) is not None:
             raise ValueError(
                 "algo.critic.mlp: it reads the arm's observation, "
@@ -94,7 +99,7 @@ def check_by_building(config: Config) -> None:
         raise UserError(f"task={config.task.name} cannot be observed by this model: add model={fitting}")
 
 
-def _refuse_memory(config: Config) -> None:
+def _refuse_previous_action(config: Config) -> None:
     """Refuse settings by which a policy reads its previous action where that is not observed.
 
     Raises:

@@ -10,7 +10,8 @@ SOURCE is a run folder (its newest checkpoint), a checkpoint or a policy's file.
   batch=null           environments at once, to save memory; null: all. Other batches play other episodes
   intervention=none    what the policy is shown in place of what its agents see, on the same scenes: blind, no obstacle;
                        swap_obstacles, another scene's; sensed_only, none from memory; hide_lengths, without their
-                       lengths; swap_opening, an oracle is told another scene's opening
+                       lengths; swap_opening, an oracle is told another scene's opening; forget, a recurrent
+                       policy's memory is emptied before every step
   threads=null         null: every core that this process may use
   device=cpu           cpu, cuda or cuda:<index>
   out=null             folder for episodes.csv and summary.json; null: SOURCE/evaluations/... of a run folder,

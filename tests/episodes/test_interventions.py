@@ -15,7 +15,7 @@ from softgm_bench.errors import UserError
 from softgm_bench.rod.parameters import RodParameters
 
 POLICIES = Path(__file__).parents[2] / "experiments" / "policies"
-NAMES = [name for name in INTERVENTIONS if name != "none"]
+NAMES = [name for name in INTERVENTIONS if name not in ("none", "forget")]  # the latter is of policies that remember
 CHANGED = {
     "blind": set(OBSTACLES),
     "swap_obstacles": set(OBSTACLES),

@@ -69,6 +69,7 @@ def actor_config(**changes):
         "persistence": 0.0,
         "embedding_norm": False,
         "relative_points": False,
+        "memory": None,
     }
     return ActorConfig(**(values | changes))
 

@@ -20,6 +20,7 @@ from softgm_bench.envs import entries
 from softgm_bench.envs.interface import Environment, Sizes
 from softgm_bench.models.action_value import ACTION_VALUE, build_action_value
 from softgm_bench.models.heads import AgentHead, input_keys, told_points
+from softgm_bench.models.memory import MemoryConfig
 from softgm_bench.models.registry import Encoder, build_encoder
 
 
@@ -31,11 +32,13 @@ class DeterministicActorConfig:
         widths: hidden layers, each followed by tanh.
         embedding_norm: g_i is normalised before it enters the head (paper: no); see ``models.registry.Normalised``.
         relative_points: an oracle's actor is told the privileged points relative to each agent too.
+        memory: None; PPO alone trains recurrent actors.
     """
 
     widths: list[int]
     embedding_norm: bool
     relative_points: bool
+    memory: MemoryConfig | None
 
 
 @dataclass

@@ -50,6 +50,10 @@ class OffPolicyConfig:
         Raises:
             ValueError: with one line naming the key, its value and what would be right.
         """
+        if getattr(getattr(self, "actor", None), "memory", None) is not None:
+            raise ValueError(
+                f"algo.actor.memory with algo={self.name}: recurrent actors are trained by PPO: ippo, mappo, softgm"
+            )
         for field in fields(self):
             value, wanted = getattr(self, field.name), BOUNDS.get(field.name)
             if wanted is not None and value is not None and not wanted[0](value):

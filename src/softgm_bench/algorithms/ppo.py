@@ -97,6 +97,10 @@ class PPOConfig:
 class PPO:
     """TorchRL's ``ClipPPOLoss`` and ``GAE`` with an optimiser each for actor and critic.
 
+    An actor with memory is trained on sequences: each environment's steps of a batch, from the hidden state that its
+    first frame was met with, which is the older policy's and no gradient passes (truncated backpropagation through
+    time). Critics read frames alone.
+
     Attributes:
         policy: what the collector and the evaluation call; shares its parameters with the loss.
         trained_frames: how many frames the updates so far have learnt from.
@@ -139,6 +143,7 @@ class PPO:
         # What an update reads of a frame; everything else stays out of the minibatches.
         read = dict.fromkeys((*self.policy.in_keys, *self.critic.in_keys))
         self._trained_on = (*read, entries.ACTION, entries.LOG_PROB, ADVANTAGE, VALUE_TARGET)
+        self._in_sequences = config.actor.memory is not None  # minibatches are of whole environments, not of frames
         self._actor_parameters = list(self.policy.parameters())
         self._critic_parameters = list(self.critic.parameters())
         self.actor_optimizer = torch.optim.Adam(self._actor_parameters, lr=config.actor_lr, eps=1e-5, fused=True)
@@ -184,10 +189,12 @@ class PPO:
         """Estimate advantages and value targets, and flatten to frames ``(num_envs * steps,)``.
 
         Advantages are every agent's, ``(frames, N, 1)``. Value targets have the shape of the critic's values, and with
-        value normalisation their scale.
+        value normalisation their scale. An actor with memory needs frames in their order: nothing is flattened then.
         """
         n_agents = batch.get(entries.LOG_PROB).shape[-1]
-        frames = self._estimate(batch, n_agents).select(*self._trained_on).reshape(-1)
+        frames = self._estimate(batch, n_agents).select(*self._trained_on)
+        if not self._in_sequences:
+            frames = frames.reshape(-1)
         advantage = frames.get(ADVANTAGE)
         if self.config.normalize_advantage:
             advantage = _standardised(advantage)
@@ -231,6 +238,8 @@ class PPO:
     def _epoch(self, frames: TensorDictBase) -> Tensor:
         """Pass once over all frames in random minibatches; means over the minibatches, in the order of ``_names``."""
         size = self.config.minibatch_size
+        if self._in_sequences:
+            size = max(1, round(size / frames.shape[1]))
         shuffled = frames[torch.randperm(len(frames), device=frames.device)]
         # a rest much smaller than a minibatch would weigh its few frames too much
         minibatches = [chosen for chosen in shuffled.split(size) if 2 * len(chosen) >= min(size, len(frames))]

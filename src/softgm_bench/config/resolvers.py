@@ -46,7 +46,8 @@ def first(*values: Any) -> Any:
 
 def label(*, _root_: DictConfig) -> str:
     """Give the name of the results, ``Config.label``, for run folders."""
-    return labelled(_root_.algo.name, _root_.model.name, _root_.observation, _root_.perturbation.name)
+    cell = OmegaConf.select(_root_, "algo.actor.memory.cell")
+    return labelled(_root_.algo.name, _root_.model.name, _root_.observation, _root_.perturbation.name, cell)
 
 
 def _node(value: Any) -> Any:

@@ -93,11 +93,13 @@ class Config:
     @property
     def label(self) -> str:
         """The algorithm's name as results carry it."""
-        return labelled(self.algo.name, model_name(self.model), self.observation, self.perturbation.name)
+        memory = getattr(getattr(self.algo, "actor", None), "memory", None)
+        cell = None if memory is None else memory.cell
+        return labelled(self.algo.name, model_name(self.model), self.observation, self.perturbation.name, cell)
 
 
-def labelled(algo: str, model: str, observation: str, perturbation: str) -> str:
-    """``algo``, and whatever in model, observation and perturbation makes its results another kind's.
+def labelled(algo: str, model: str, observation: str, perturbation: str, memory: str | None = None) -> str:
+    """``algo``, and whatever in model, memory, observation and perturbation makes its results another kind's.
 
     SoftGM has the model that it is named after, the other algorithms an MLP; any other is named. A model whose name
     begins with the algorithm's, such as an ablation's, names both.
@@ -105,8 +107,8 @@ def labelled(algo: str, model: str, observation: str, perturbation: str) -> str:
     own = "softgm" if algo.startswith("softgm") else "mlp"
     if model.startswith(f"{algo}_"):
         algo, own = model, model
-    usual = {own: model, "standard": observation, "none": perturbation}
-    return "_".join([algo, *(value for default, value in usual.items() if value != default)])
+    usual = ((own, model), (None, memory), ("standard", observation), ("none", perturbation))
+    return "_".join([algo, *(value for default, value in usual if value is not None and value != default)])
 
 
 def group_schemas() -> dict[str, dict[str, type]]:

@@ -18,6 +18,7 @@ NEUTRAL: dict[str, Any] = {
     "algo.critic.embedding_norm": False,
     "algo.actor.relative_points": False,
     "model.remember": False,
+    "algo.actor.memory": None,
 }
 ABLATIONS = ("softgm_no_stage1", "softgm_no_stage2")  # algorithms then, models of the algorithm softgm now
 

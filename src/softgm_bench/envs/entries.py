@@ -108,11 +108,15 @@ PRIVILEGED = _entry("privileged", shape=("P",))
 
 ACTION = _entry("agents", "action", shape=("N", "A"), bounded=True)
 LOG_PROB = ("agents", "action_log_prob")  # (B, N), written by policies
+# Of policies that remember: hidden states (B, N, H) before a frame, and, written by them, after it.
+MEMORY = ("agents", "memory")
+NEXT_MEMORY = ("next", *MEMORY)
 
 REWARD = _entry("reward", episode={"discounted_return": DISCOUNTED, "undiscounted_return": SUM})  # the team's
 DONE = _entry("done", dtype=torch.bool, episode={"length": STEPS})
 TERMINATED = _entry("terminated", dtype=torch.bool)  # success or divergence
 TRUNCATED = _entry("truncated", dtype=torch.bool)  # the horizon alone
+IS_INIT = _entry("is_init", dtype=torch.bool)  # an episode's first frame: nothing may be remembered
 
 # Metrics, which no policy reads.
 SUCCESS = _entry("info", "success", dtype=torch.bool, episode={"success": EVER})

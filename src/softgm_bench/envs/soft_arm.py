@@ -6,11 +6,11 @@ from contextlib import AbstractContextManager
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.envs import EnvBase
 
 from softgm_bench.envs import entries
 from softgm_bench.envs.interface import Sizes
 from softgm_bench.envs.perturbation import PerturbationConfig
+from softgm_bench.envs.remembering import RememberingEnv
 from softgm_bench.envs.sensing import Sight
 from softgm_bench.envs.simulation import Episodes, Simulator
 from softgm_bench.envs.specs import make_specs
@@ -30,7 +30,7 @@ def sizes_of(task: Task) -> Sizes:
     )
 
 
-class SoftArmEnv(EnvBase):
+class SoftArmEnv(RememberingEnv):
     """A TorchRL environment with ``batch_size=(num_envs,)``; entries and shapes in ``softgm_bench.envs.entries``.
 
     One step is one control step of the rod. An environment that is done does not move until it is reset. Resets are
@@ -151,7 +151,8 @@ class SoftArmEnv(EnvBase):
         episodes = self.simulator.state.episodes
         outcome = self.simulator.step(tensordict.get(entries.ACTION).clamp(-1.0, 1.0))
         verdict = outcome.verdict
-        return self._frame(episodes, outcome.sight, verdict.numbers, verdict.success, outcome.broken)
+        begins = torch.zeros_like(outcome.broken)
+        return self._frame(episodes, outcome.sight, verdict.numbers, verdict.success, outcome.broken, begins)
 
     # frames
 
@@ -165,10 +166,16 @@ class SoftArmEnv(EnvBase):
             **dict.fromkeys((entries.TIP_STEP, entries.TORQUE_PER_AGENT, entries.TORQUE_JOINT), zero),
             **{(entries.REWARD_TERMS, name): zero for name in entries.REWARD_TERM_NAMES},
         }
-        return self._frame(episodes, sight, numbers, never, never)
+        return self._frame(episodes, sight, numbers, never, never, torch.ones_like(never))
 
     def _frame(
-        self, episodes: Episodes, sight: Sight, numbers: Mapping[NestedKey, Tensor], success: Tensor, broken: Tensor
+        self,
+        episodes: Episodes,
+        sight: Sight,
+        numbers: Mapping[NestedKey, Tensor],
+        success: Tensor,
+        broken: Tensor,
+        begins: Tensor,
     ) -> TensorDict:
         """Make everything that a step or a reset writes, in tensors of its own.
 
@@ -187,8 +194,9 @@ class SoftArmEnv(EnvBase):
         )
         if self.simulator.perturbation is not None:
             own = self.simulator.perturbation.observed(*own)
-        ends = (success, broken, episodes.terminated, episodes.truncated, episodes.terminated | episodes.truncated)
-        success, broken, terminated, truncated, done = torch.stack(ends).unsqueeze(-1).unbind(0)
+        done = episodes.terminated | episodes.truncated
+        flags = torch.stack([success, broken, episodes.terminated, episodes.truncated, done, begins])
+        success, broken, terminated, truncated, done, begins = flags.unsqueeze(-1).unbind(0)
         tip, target = torch.stack([position[..., -1], episodes.scene.target]).to(torch.float32).unbind(0)
         values: dict[NestedKey, Tensor] = {
             **dict(zip((entries.AGENT_POSITION, entries.AGENT_VELOCITY, entries.PREVIOUS_ACTION), own, strict=True)),
@@ -202,6 +210,7 @@ class SoftArmEnv(EnvBase):
             entries.TERMINATED: terminated,
             entries.TRUNCATED: truncated,
             entries.DONE: done,
+            entries.IS_INIT: begins,
             **columns,
             **dict(zip(numbers, _columns(*numbers.values()), strict=True)),
         }

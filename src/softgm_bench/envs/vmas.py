@@ -11,10 +11,10 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase
 
 from softgm_bench.envs import entries
 from softgm_bench.envs.interface import Kind, Settings, Sizes, register_kind
+from softgm_bench.envs.remembering import RememberingEnv
 
 OBSERVATION = ("agents", "observation")  # (B, N, F) float32: all that an agent observes
 DIRECTIONS = 2  # of a force in the plane
@@ -48,7 +48,7 @@ class VmasConfig:
             raise ValueError(f"task.horizon is {self.horizon}: it must be at least 1")
 
 
-class VmasEnv(EnvBase):
+class VmasEnv(RememberingEnv):
     """A VMAS scenario with ``batch_size=(num_envs,)``: entry ``OBSERVATION`` and those of ``entries`` that fit.
 
     The reward is the team's, the mean over agents of VMAS's rewards. TorchRL's own ``VmasEnv`` resets one environment
@@ -98,7 +98,7 @@ class VmasEnv(EnvBase):
         observation = Unbounded(shape=(size, n_agents, self.sizes.n_features), dtype=torch.float32)
         action = Bounded(-1.0, 1.0, shape=(size, n_agents, self.sizes.action), dtype=torch.float32)
         self.observation_spec = Composite(
-            agents=Composite(observation=observation, shape=(size, n_agents)), shape=(size,)
+            agents=Composite(observation=observation, shape=(size, n_agents)), is_init=flag(), shape=(size,)
         )
         self.action_spec = Composite(agents=Composite(action=action, shape=(size, n_agents)), shape=(size,))
         self.reward_spec = Unbounded(shape=(size, 1), dtype=torch.float32)
@@ -156,6 +156,7 @@ class VmasEnv(EnvBase):
         terminated, truncated = self._terminated.unsqueeze(-1), self._truncated.unsqueeze(-1)
         agents = TensorDict({"observation": self._observation.clone()}, (*self.batch_size, self.sizes.n_agents))
         flags = {"terminated": terminated.clone(), "truncated": truncated.clone(), "done": terminated | truncated}
+        flags |= {"is_init": (self._steps == 0).unsqueeze(-1)}
         return TensorDict({"agents": agents, **flags}, self.batch_size, device=self.device)
 
     def _observe(self) -> Tensor:

@@ -242,11 +242,15 @@ def _side_by_side(frame: TensorDictBase, columns: Sequence[Column]) -> Tensor:
 def act(policy: TensorDictModuleBase, data: TensorDictBase, alive: Tensor) -> TensorDictBase:
     """Choose the actions of the environments whose first episode goes on; zeros, unpaid for, in the others.
 
-    On a device where reading ``alive`` would wait, all are paid for.
+    With them goes what a policy remembers. On a device where reading ``alive`` would wait, all are paid for.
     """
     if not sync.is_free(alive.device) or alive.all():
         return policy(data)
-    action = policy(data[alive])[entries.ACTION]
-    data[entries.ACTION] = action.new_zeros(*alive.shape, *action.shape[1:])
-    data[entries.ACTION][alive] = action
+    chosen = policy(data[alive])
+    for key in (entries.ACTION, entries.NEXT_MEMORY):
+        of_some = chosen.get(key, None)
+        if of_some is not None:
+            of_all = of_some.new_zeros(*alive.shape, *of_some.shape[1:])
+            of_all[alive] = of_some
+            data.set(key, of_all)
     return data

@@ -7,6 +7,7 @@ episodes that go on, and another scene must stay the same other scene to an epis
 
 from collections.abc import Callable
 
+import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
@@ -50,9 +51,15 @@ def hide_lengths(frame: TensorDictBase) -> TensorDictBase:
     return _with(frame, {entries.SLOT_DESCRIPTOR: descriptor})
 
 
+def forget(frame: TensorDictBase) -> TensorDictBase:
+    """Let a policy that remembers begin every step with an empty memory."""
+    state = frame.get(entries.MEMORY, None)  # absent before the first step
+    return frame if state is None else _with(frame, {entries.MEMORY: torch.zeros_like(state)})
+
+
 INTERVENTIONS: dict[str, Intervention | None] = {"none": None} | {
     intervention.__name__: intervention
-    for intervention in (blind, swap_obstacles, sensed_only, swap_opening, hide_lengths)
+    for intervention in (blind, swap_obstacles, sensed_only, swap_opening, hide_lengths, forget)
 }
 
 
@@ -81,6 +88,9 @@ def check_fits(name: str, trained: TrainedPolicy) -> None:
     if name == "swap_opening":
         if entries.PRIVILEGED not in trained.policy.in_keys:
             raise UserError(f"intervention={name}: this policy is told no opening; an oracle's is, on a wall")
+    elif name == "forget":
+        if entries.MEMORY not in trained.policy.in_keys:
+            raise UserError(f"intervention={name}: this policy has no memory; one of algo.actor.memory has")
     elif name != "none" and not kind_of(task).sizes(task).n_slots:
         raise UserError(f"intervention={name}: task={task.name} shows no obstacles")
 

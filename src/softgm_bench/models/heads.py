@@ -25,6 +25,7 @@ from softgm_bench.envs import entries
 from softgm_bench.envs.interface import Sizes
 from softgm_bench.models import graph
 from softgm_bench.models.activation import Tanh
+from softgm_bench.models.memory import Memory, MemoryConfig
 from softgm_bench.models.mlp import MLPConfig
 from softgm_bench.models.registry import Encoder, TeamEncoder, build_encoder, build_team_encoder
 from softgm_bench.upstream.squashed_normal import SquashedNormal
@@ -52,6 +53,7 @@ class ActorConfig:
             Above 0, exploration is correlated in time: it moves a slow arm where independent noise only shakes it.
         embedding_norm: g_i is normalised before it enters the head (paper: no); see ``models.registry.Normalised``.
         relative_points: an oracle's actor is told the privileged points relative to each agent too.
+        memory: each agent remembers, by a recurrent cell before the head; None: it does not (paper).
     """
 
     widths: list[int]
@@ -63,6 +65,7 @@ class ActorConfig:
     persistence: float
     embedding_norm: bool
     relative_points: bool
+    memory: MemoryConfig | None
 
     def __post_init__(self) -> None:
         """Refuse values that give no policy.
@@ -140,7 +143,11 @@ class AgentHead(nn.Module):
     """``f([o_i || g_i])`` for every agent with shared parameters; o_i is the agent's own node (15 channels).
 
     With privileged channels w it is ``f([o_i || g_i || w])``; with points p_k among them, ``f([o_i || g_i || w ||
-    p_1 - p_i || ..])`` with p_i the agent's position, as o_i holds the target.
+    p_1 - p_i || ..])`` with p_i the agent's position, as o_i holds the target. With a memory f reads the agent's hidden
+    state too, beside all that the memory reads: ``f([x_i || h_i])``, where x_i is f's input without one.
+
+    Attributes:
+        in_keys: the entries that are read.
     """
 
     def __init__(
@@ -151,6 +158,7 @@ class AgentHead(nn.Module):
         last_gain: float,
         n_privileged: int = 0,
         n_points: int = 0,
+        memory: MemoryConfig | None = None,
     ) -> None:
         """Put f (hidden layers ``widths``, last layer scaled by ``last_gain``) on an encoder, which gives g_i.
 
@@ -160,6 +168,9 @@ class AgentHead(nn.Module):
         self.encoder = encoder
         self.n_privileged, self.n_points = n_privileged, n_points
         in_features = encoder.own_features + encoder.out_features + n_privileged + 3 * n_points
+        self.memory = None if memory is None else Memory(memory, in_features)
+        in_features += 0 if memory is None else memory.size
+        self.in_keys = input_keys(encoder, n_privileged) + ([] if self.memory is None else self.memory.in_keys)
         self.function = feedforward(in_features, widths, out_features, last_gain)
 
     def forward(self, td: TensorDictBase) -> Tensor:
@@ -167,14 +178,15 @@ class AgentHead(nn.Module):
         return self.function(self.inputs(td))
 
     def inputs(self, td: TensorDictBase) -> Tensor:
-        """What f reads, ``(..., N, in_features)``."""
+        """What f reads, ``(..., N, in_features)``; a memory's next state is written to ``td``."""
         parts = [self.encoder.own(td), self.encoder(td)]
         if self.n_privileged:
             known = td.get(entries.PRIVILEGED).unsqueeze(-2)
             parts.append(known.expand(*parts[0].shape[:-1], self.n_privileged))
         if self.n_points:
             parts.append(graph.relative_points(td, self.n_points))
-        return torch.cat(parts, dim=-1)
+        own = torch.cat(parts, dim=-1)
+        return own if self.memory is None else torch.cat([own, self.memory(td, own)], dim=-1)
 
 
 @torch.no_grad()
@@ -197,7 +209,7 @@ def actor_saturation(policy: nn.Module, batch: TensorDictBase) -> dict[str, floa
     count = min(batch.numel(), SATURATION_FRAMES)
     frames = torch.arange(count, device=batch.device) * batch.numel() // count
     chosen = (frames // batch.shape[1], frames % batch.shape[1])
-    read = batch.select(*input_keys(head.encoder, head.n_privileged))[chosen]
+    read = batch.select(*head.in_keys)[chosen]
     size = head.function[0](head.inputs(read)).abs()
     share, mean = torch.stack([(size > SATURATED).float().mean(), size.mean()]).tolist()
     return {"actor_saturation": share, "actor_preactivation": mean}
@@ -211,9 +223,10 @@ class GaussianPolicy(TensorDictModuleBase):
     ) -> None:
         """Put the policy's head on an encoder; ``actions`` is A, the numbers in one agent's action."""
         super().__init__()
-        self.in_keys, self.out_keys = input_keys(encoder, n_privileged), [LOC, SCALE]
         outputs = 2 * actions if config.state_dependent_sigma else actions
-        self.head = AgentHead(encoder, config.widths, outputs, 0.01, n_privileged, n_points)
+        self.head = AgentHead(encoder, config.widths, outputs, 0.01, n_privileged, n_points, config.memory)
+        memory = self.head.memory
+        self.in_keys, self.out_keys = self.head.in_keys, [LOC, SCALE, *([] if memory is None else memory.out_keys)]
         self.persistence = config.persistence
         self.low, self.range = math.log(config.min_sigma), math.log(config.max_sigma / config.min_sigma)
         fraction = torch.tensor((math.log(config.initial_sigma) - self.low) / self.range)
@@ -287,7 +300,9 @@ def build_actor(
 ) -> ProbabilisticTensorDictSequential:
     """Build the squashed Gaussian actor, which reads ``entries.OBSERVATION``.
 
-    It writes ``entries.ACTION`` and ``entries.LOG_PROB`` (B, N).
+    It writes ``entries.ACTION`` and ``entries.LOG_PROB`` (B, N). With a memory it goes from frame to frame ``(B,)``,
+    reads ``entries.MEMORY`` and ``entries.IS_INIT`` and writes ``entries.NEXT_MEMORY``, and ``get_dist`` of frames
+    ``(B, T)`` gives the distributions of T consecutive steps.
 
     It samples unless ``set_exploration_type`` says otherwise. tensordict's module is used and not TorchRL's
     ``ProbabilisticActor``: the latter (0.14.1) stores the log-probability of the pre-tanh sample, which differs from
