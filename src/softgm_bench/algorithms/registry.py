@@ -31,7 +31,8 @@ class Algorithm(Protocol):
     def update(self, batch: TensorDictBase) -> dict[str, float]:
         """Learn from ``(num_envs, steps)`` consecutive frames of the current policy; returns metrics to write down.
 
-        The names of the metrics must be the same every time.
+        The names of the metrics must be the same every time. A run stops as diverged where one that begins with
+        ``loss_`` or ends in ``_grad_norm`` is not finite, unless ``gradient_steps`` among them is 0.
         """
 
     def state_dict(self) -> dict[str, Any]:

@@ -15,8 +15,8 @@ from softgm_bench.assembly import build_algorithm, build_env
 from softgm_bench.config import Config, plain
 from softgm_bench.episodes.evaluation import EpisodeRecords
 from softgm_bench.episodes.summary import summarise, table
-from softgm_bench.errors import UserError
-from softgm_bench.runs import checkpoint, ending, folder, resume
+from softgm_bench.errors import NotFinite, UserError
+from softgm_bench.runs import checkpoint, divergence, ending, folder, resume
 from softgm_bench.runs.budget import Budget
 from softgm_bench.runs.interruption import Interrupted, Interruption
 from softgm_bench.runs.loggers.guarded import Loggers
@@ -38,6 +38,7 @@ def train(config: Config) -> dict[str, Any]:
 
     Raises:
         UserError: the run folder cannot be used, or not any longer, or holds a run with other settings.
+        NotFinite: training has diverged; the last finite checkpoint is left, and why it failed, but no summary.
         Interrupted: SIGINT or SIGTERM; a checkpoint of the last whole iteration is left.
     """
     if config.resume and (summary := resume.finished(config, total_frames(config))) is not None:
@@ -69,9 +70,20 @@ def _go(run: Run) -> EpisodeRecords:
             with interruption.at_once():
                 seed = run.seeds.final_evaluation
                 return ending.play(run, settings.final_episodes, seed, settings.final_horizon)
+        except NotFinite as error:
+            raise _told(run, error) from error
         except Interrupted as stop:
             stop.args = (f"interrupted after {run.frames} frames, resume=true resumes it; checkpoint: {_save(run)}",)
             raise
+
+
+def _told(run: Run, error: NotFinite) -> NotFinite:
+    """Complete the message, and leave it in the run's folder."""
+    kept = run.folder.newest()
+    last = f"the last finite checkpoint is {kept}" if kept else "there was no checkpoint yet"
+    line = f"{error} after {run.frames} frames: training has diverged, {last}; try smaller learning rates"
+    folder.write_failure(run.folder, line)
+    return NotFinite(line)
 
 
 def _build(config: Config) -> Run:
@@ -125,6 +137,7 @@ def _learn(run: Run, interruption: Interruption, progress: Progress) -> None:
             row = _row(run, batch, losses, time.perf_counter() - began)
             metrics.write(row)
             run.loggers.metrics(row)
+            divergence.check_update(run.algorithm, batch, losses)
             progress.advance(batch.numel(), row.get("success_rate", math.nan))
             interruption.check()
             run.budget.lap()
