@@ -15,6 +15,7 @@ from yaml import YAMLError
 from softgm_bench import process
 from softgm_bench.config import CHANGEABLE
 from softgm_bench.config.explain import USER_ERRORS, explain
+from softgm_bench.config.numbers import check_finite
 from softgm_bench.errors import UserError
 
 Options = TypeVar("Options")
@@ -64,7 +65,7 @@ def parse(
         The path, the options, and the policy's settings as they were written.
 
     Raises:
-        UserError: no path or several, an unknown setting, or a value of the wrong type.
+        UserError: no path or several, an unknown setting, a value of the wrong type, or a number that is not finite.
     """
     paths = [argument for argument in arguments if "=" not in argument or Path(argument).exists()]
     if len(paths) != 1 or paths[0].startswith("-"):
@@ -88,4 +89,5 @@ def parse(
         raise UserError(f"{', '.join(own)}: a value that cannot be read") from error
     except OmegaConfBaseException as error:
         raise UserError(f"{error.full_key}: {str(error).splitlines()[0]}") from error
+    check_finite(OmegaConf.to_container(merged))
     return Path(paths[0]), cast(Options, OmegaConf.to_object(merged)), rest
