@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from softgm_bench import process
+from softgm_bench import output, process
 from softgm_bench.config import CHANGEABLE
 from softgm_bench.config.explain import USER_ERRORS, explain
 from softgm_bench.config.numbers import check_finite
@@ -33,7 +33,11 @@ def run(name: str, text: str | None, body: Callable[[list[str]], None]) -> int:
         The exit status: 0; 2 after one line about what is wrong; 130 when interrupted.
     """
     process.prepare()
-    arguments = sys.argv[1:]
+    with output.unbreakable():
+        return _run(name, text, body, sys.argv[1:])
+
+
+def _run(name: str, text: str | None, body: Callable[[list[str]], None], arguments: list[str]) -> int:
     if {"-h", "--help"} & set(arguments):
         print((text or "").strip())
         return 0

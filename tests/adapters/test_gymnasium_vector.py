@@ -1,5 +1,7 @@
 """The Gymnasium adapters keep Gymnasium's contract and repeat ``SoftArmEnv`` bit by bit."""
 
+import copy
+
 import gymnasium
 import numpy as np
 import pytest
@@ -159,3 +161,33 @@ def test_what_cannot_be_is_refused_in_one_line():
             env.step(action + np.inf)
     with pytest.raises(ValueError, match="reset_mask"):
         SoftArmVectorEnv("basic", 2).reset(options={"reset_mask": np.array([True, False])})
+
+
+def scene(env):
+    return env._arm.scene.target.numpy().copy()
+
+
+@pytest.mark.parametrize("kind", [SoftArmGymnasiumEnv, SoftArmVectorEnv])
+def test_copies_of_an_unseeded_environment_play_scenes_of_their_own(kind):
+    env = kind("basic", overrides=[QUICK])
+    others = [copy.deepcopy(env) for _ in range(2)]
+    for one in (env, *others):
+        one.reset()
+    assert len({tuple(scene(one).ravel()) for one in (env, *others)}) == 3
+    seeded = kind("basic", seed=3, overrides=[QUICK])
+    again = copy.deepcopy(seeded)
+    assert data_equivalence(seeded.reset(), again.reset())
+    assert data_equivalence(env.reset(seed=3), kind("basic", seed=3, overrides=[QUICK]).reset())
+
+
+def test_seeds_of_each_environment_give_the_scenes_of_environments_alone():
+    env = SoftArmVectorEnv("basic", 3, overrides=[QUICK])
+    observation, _ = env.reset(seed=[5, 1, 5])
+    alone = [SoftArmGymnasiumEnv("basic", seed, overrides=[QUICK]).reset()[0] for seed in (5, 1, 5)]
+    assert np.array_equal(observation, np.stack(alone))
+    later = env.reset()[0]
+    assert np.array_equal(env.reset(seed=[5, 1, 5])[0], observation)
+    assert np.array_equal(env.reset()[0], later)
+    env.reset(seed=[5, None, 2])
+    with pytest.raises(ValueError, match=r"^seed has 2 numbers: it must be one, or one for each of 3$"):
+        env.reset(seed=[1, 2])

@@ -1,5 +1,6 @@
 """The PettingZoo adapter keeps PettingZoo's contract and repeats ``SoftArmEnv`` bit by bit."""
 
+import copy
 import sys
 
 import numpy as np
@@ -299,3 +300,12 @@ def test_steps_that_cannot_be_are_refused():
     env.step(actions)
     with pytest.raises(ValueError, match=r"reset\(\)"):
         env.step({})
+
+
+def test_copies_of_an_unseeded_environment_play_scenes_of_their_own():
+    env = parallel_env("basic", overrides=["rod.substeps=10"])
+    other = copy.deepcopy(env)
+    seeded = [parallel_env("basic", 3, overrides=["rod.substeps=10"]), copy.deepcopy(env)]
+    targets = [one.reset() and one.arm.scene.target.numpy().copy() for one in (env, other)]
+    assert not np.array_equal(*targets)
+    assert np.array_equal(seeded[0].reset()[0]["section_0"], seeded[1].reset(seed=3)[0]["section_0"])

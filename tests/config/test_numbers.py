@@ -44,7 +44,7 @@ def test_a_rod_that_is_built_by_hand_has_finite_numbers_too(name):
 
 
 def test_the_other_commands_refuse_them_too():
-    with pytest.raises(UserError, match="^gamma=nan: it must be a finite number$"):
+    with pytest.raises(UserError, match=r"^gamma=nan: it must be a finite number$"):
         command.parse(["policy.pt", "gamma=nan"], Options, "policy")
 
 
@@ -53,7 +53,7 @@ def test_the_other_commands_refuse_them_too():
     [
         (
             ("task.target_distance=[0.9,0.5]",),
-            "task.target_distance=[0.9, 0.5]: the lower end of a range comes first, ",
+            "task.target_distance=[0.9, 0.5]: the lower end of a range comes first",
         ),
         (("task.target_distance=[0.9]",), "task.target_distance=[0.9]: it must be a range, [low, high]"),
         (("task=wall", "task.opening_y=[0.2,-0.2]"), "task.opening_y=[0.2, -0.2]: the lower end"),

@@ -34,10 +34,17 @@ ConfigStore.instance().store(group="rod", name="paper", node=asdict(RodParameter
 
 
 def config_directory() -> Path:
-    """Folder of the YAML files: inside an installed package, or at the top of the repository."""
+    """Folder of the YAML files: inside an installed package, or at the top of the repository.
+
+    Raises:
+        UserError: there is none.
+    """
     package = Path(__file__).resolve().parents[1]
     installed = package / "conf"
-    return installed if installed.is_dir() else package.parents[1] / "conf"
+    found = installed if installed.is_dir() else package.parents[1] / "conf"
+    if not found.is_dir():  # inside of an archive, where Hydra and Numba find nothing either
+        raise UserError(f"{package}: no folder with the settings beside it: install the wheel, pip install FILE.whl")
+    return found
 
 
 def compose(overrides: list[str]) -> Config:

@@ -5,6 +5,7 @@
 waits for the device: see ``softgm_bench.rod.sync``.
 """
 
+import copy
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import NamedTuple
@@ -149,6 +150,17 @@ class Simulator:
         self.state = Simulation(
             episodes=fresh.clone(), progress=progress, push=nothing, tip_force=nothing.clone(), batch_size=[num_envs]
         )
+
+    def __deepcopy__(self, memo: dict[int, object]) -> "Simulator":
+        """A simulator that moves on its own; what never changes is shared.
+
+        Without this a copy would move the same arms: a tensorclass gives itself in place of a copy.
+        """
+        other = copy.copy(self)
+        other.state = self.state.clone()
+        other._generator = copy.deepcopy(self._generator, memo)
+        other.perturbation = copy.deepcopy(self.perturbation, memo)
+        return other
 
     # generators
 

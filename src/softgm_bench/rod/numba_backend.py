@@ -18,7 +18,7 @@ from softgm_bench.rod.numba_kernel import jit, larger, make_kernel, make_straigh
 from softgm_bench.rod.numba_layout import CACHE_LINE, Layout, constant_rows, make_layout
 from softgm_bench.rod.parameters import CONTACT_MODELS, RodParameters, rod_constants
 from softgm_bench.rod.scalar_contact import EDGE, RADIUS, START
-from softgm_bench.rod.state import Cylinders, RodState, check_inputs
+from softgm_bench.rod.state import Cylinders, RodState, check_inputs, refuse_gradients
 
 
 class NumbaBackend:
@@ -55,9 +55,10 @@ class NumbaBackend:
             A new state.
 
         Raises:
-            ValueError: if the arguments' shapes do not fit together.
+            ValueError: if the arguments' shapes do not fit together, or a gradient is asked for.
         """
         check_inputs(self.parameters, state, couple, force, cylinders, active)
+        refuse_gradients("numba", couple, force, state.position, state.director, state.velocity, state.omega)
         dtype = state.position.dtype
         num_envs, n = couple.shape[0], self.parameters.n_elements
         rows, scalars, contact = self._table(dtype)

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
+from softgm_bench import output
 from softgm_bench.algorithms import Algorithm
 from softgm_bench.assembly import build_algorithm, build_env
 from softgm_bench.config import Config, plain
@@ -19,7 +20,7 @@ from softgm_bench.errors import NotFinite, UserError
 from softgm_bench.runs import checkpoint, divergence, ending, folder, resume
 from softgm_bench.runs.budget import Budget
 from softgm_bench.runs.interruption import Interrupted, Interruption
-from softgm_bench.runs.loggers.guarded import Loggers
+from softgm_bench.runs.loggers.guarded import Loggers, refuse_missing
 from softgm_bench.runs.loggers.video import episode_video
 from softgm_bench.runs.machine import keep_memory, set_matmul, set_threads
 from softgm_bench.runs.metrics import CsvWriter, EpisodeTracker, step_metrics
@@ -39,10 +40,16 @@ def train(config: Config) -> dict[str, Any]:
     Raises:
         UserError: the run folder cannot be used, or not any longer, or holds a run with other settings.
         NotFinite: training has diverged; the last finite checkpoint is left, and why it failed, but no summary.
-        Interrupted: SIGINT or SIGTERM; a checkpoint of the last whole iteration is left.
+        Interrupted: SIGINT or one of ``interruption.STOPPING``; a checkpoint of the last whole iteration is left.
     """
+    with output.unbreakable():
+        return _train(config)
+
+
+def _train(config: Config) -> dict[str, Any]:
     if config.resume and (summary := resume.finished(config, total_frames(config))) is not None:
         return summary
+    refuse_missing(config)
     run = _build(config)
     try:
         with folder.exclusive(config.run_dir):
