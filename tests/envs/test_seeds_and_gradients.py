@@ -86,3 +86,24 @@ def test_a_gradient_through_the_default_backend_is_refused_and_torchs_is_that_of
     moved[0, 3, 0] = 0.01
     difference = (rewards("torch", action + moved) - rewards("torch", action - moved)) / 0.02
     assert float(leaf.grad[0, 3, 0]) == pytest.approx(float(difference), rel=2e-2)
+
+
+@pytest.fixture
+def _double():
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    yield
+    torch.set_default_dtype(before)
+
+
+@pytest.mark.usefixtures("_double")
+@pytest.mark.parametrize("algo", ["softgm", "ippo", "masac", "maddpg"])
+def test_the_default_type_of_torch_changes_no_entry_and_no_network(algo):
+    env = api.make_env(*SMALL, "perturbation=noise", num_envs=4)
+    for key, value in env.reset().items(True, True):
+        assert value.dtype in (torch.float32, torch.bool), key
+    algorithm = api.build_algorithm(api.configure(*SMALL, f"algo={algo}"), env)
+    assert {parameter.dtype for parameter in algorithm.policy.parameters()} == {torch.float32}
+    frames = api.rollout(env, algorithm.policy, steps=3, deterministic=False)
+    assert frames[entries.ACTION].dtype == torch.float32
+    assert torch.get_default_dtype() == torch.float64

@@ -10,6 +10,7 @@ from softgm_bench.envs.interface import Kind, Settings, register_kind
 from softgm_bench.envs.perturbation import PerturbationConfig
 from softgm_bench.envs.soft_arm import SoftArmEnv, sizes_of
 from softgm_bench.envs.tasks import TASK_CONFIGS, TaskConfig, make_task
+from softgm_bench.rod import forks
 from softgm_bench.rod.backend import default_backend, make_backend
 from softgm_bench.rod.parameters import RodParameters
 from softgm_bench.rod.stability import check_time_step
@@ -65,6 +66,7 @@ def _check(settings: Settings) -> None:
     Raises:
         ValueError: with one line naming the key, its value and what would be right.
     """
+    forks.check()  # before tensors are computed with
     config, rod = settings.task, settings.rod
     check_time_step(rod)
     task, drawn = make_task(config), torch.Generator()

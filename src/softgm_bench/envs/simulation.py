@@ -261,9 +261,11 @@ class Simulator:
         blank = Beginning(
             rod=straight_rods(self.backend.parameters, count, self.dtype, self.device),
             table=empty_table(count, self.n_slots, self._n_bins, self.device),
-            previous_action=torch.zeros((count, self.task.config.n_agents, DIRECTIONS), device=self.device),
+            previous_action=torch.zeros(
+                (count, self.task.config.n_agents, DIRECTIONS), dtype=torch.float32, device=self.device
+            ),
             never=torch.zeros(count, dtype=torch.bool, device=self.device),
-            whole=torch.ones(count, device=self.device),
+            whole=torch.ones(count, dtype=torch.float32, device=self.device),
         )
         if not sync.is_free(self.device):
             self._beginnings[count] = blank

@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from softgm_bench.rod import forks
 from softgm_bench.rod.numba_contact import COLUMNS, NEXT_CHECK, make_contact, make_touch
 from softgm_bench.rod.numba_kernel import jit, larger, make_kernel, make_straighten
 from softgm_bench.rod.numba_layout import CACHE_LINE, Layout, constant_rows, make_layout
@@ -26,6 +27,7 @@ class NumbaBackend:
 
     def __init__(self, parameters: RodParameters) -> None:
         """Prepare for one arm; compilation happens at the first step of each precision and is cached on disk."""
+        forks.check()
         self.parameters = parameters
         self._constants = rod_constants(parameters)
         gravity = np.asarray(parameters.gravity)[:, None] * self._constants.mass
@@ -58,6 +60,7 @@ class NumbaBackend:
             ValueError: if the arguments' shapes do not fit together, or a gradient is asked for.
         """
         check_inputs(self.parameters, state, couple, force, cylinders, active)
+        forks.check()
         refuse_gradients("numba", couple, force, state.position, state.director, state.velocity, state.omega)
         dtype = state.position.dtype
         num_envs, n = couple.shape[0], self.parameters.n_elements
@@ -81,6 +84,7 @@ class NumbaBackend:
             contact,
             self.parameters.substeps if substeps is None else substeps,
         )
+        forks.note_threads()
         return new
 
     def _table(self, dtype: torch.dtype) -> tuple[NDArray, NDArray, NDArray]:

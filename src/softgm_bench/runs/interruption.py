@@ -30,7 +30,7 @@ class Interrupted(KeyboardInterrupt):
 
 
 class Interruption:
-    """A first SIGINT or one of ``STOPPING`` waits for ``check`` or ``at_once`` while entered; a second stops at once."""
+    """While entered, a first SIGINT or ``STOPPING`` waits for ``check`` or ``at_once``; a second stops anywhere."""
 
     def __init__(self) -> None:
         """Nothing has arrived yet."""

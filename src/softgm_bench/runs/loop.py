@@ -28,6 +28,7 @@ from softgm_bench.runs.progress import Progress
 from softgm_bench.runs.run import Run, derive_seeds, frames_per_iteration, total_frames
 from softgm_bench.storage.files import to_json
 from softgm_bench.storage.run_folder import RunFolder
+from softgm_bench.upstream import default_dtype
 from softgm_bench.upstream.collector import FrameCollector, RecordingCollector
 
 
@@ -42,7 +43,7 @@ def train(config: Config) -> dict[str, Any]:
         NotFinite: training has diverged; the last finite checkpoint is left, and why it failed, but no summary.
         Interrupted: SIGINT or one of ``interruption.STOPPING``; a checkpoint of the last whole iteration is left.
     """
-    with output.unbreakable():
+    with output.unbreakable(), default_dtype.float32():
         return _train(config)
 
 

@@ -142,7 +142,10 @@ class TestWandb:
         paths = sorted(tmp_path.glob("wandb/offline-run-*/run-*.wandb"), key=lambda path: len(path.stem))
         first = (tmp_path / "wandb/run_id").read_text()
         assert {path.stem for path in paths} == {f"run-{first}", f"run-{first}-16", f"run-{first}-32"}
-        rows = [row for path in paths for row in wandb_file.history(path)]
+        deadline = time.monotonic() + 60  # W&B writes in a process of its own
+        while len(rows := [row for path in paths for row in wandb_file.history(path)]) < 3:
+            assert time.monotonic() < deadline
+            time.sleep(0.2)
         assert sorted(row["_step"] for row in rows) == sorted(row["frames"] for row in rows)
         assert {row["_step"] for row in rows} == {16, 32, 48}
 
