@@ -66,13 +66,17 @@ def test_ranges_go_upwards(overrides, says):
 
 @pytest.mark.parametrize(
     "override",
-    ["rod.dt=1e-3", "rod.n_elements=120", "rod.youngs_modulus=5e6", "rod.density=100", "rod.base_radius=0.004"],
+    ["rod.dt=1e-3", "rod.n_elements=120", "rod.youngs_modulus=5e6", "rod.density=100"],
 )
 def test_a_time_step_beyond_the_integrators_limit_is_refused_with_one_that_would_do(override):
     line = refusal(override)
     assert "the integrator is stable up to" in line
     advised = line.partition("give ")[2].split()
     configure([override.replace("rod.dt=1e-3", "seed=0"), *advised])
+
+
+def test_a_shorter_arm_has_shorter_elements():
+    assert "the integrator is stable up to" in refusal("rod.base_length=0.5")
 
 
 def test_what_the_arm_cannot_reach_is_refused_with_what_would_do():

@@ -203,7 +203,7 @@ class SoftArmGymnasiumEnv(gymnasium.Env[Array, Array]):
         reward, terminated, truncated = ends(td)
         return joint_view(td)[0], reward, terminated, truncated, info_row(info_columns(td), 0)
 
-    def render(self) -> Array | None:  # type: ignore[override]
+    def render(self) -> Array | None:
         """Draw the arm as it stands, ``(height, width, 3)`` uint8; None without a ``render_mode``."""
         if self._film is None or self._td is None:
             return None

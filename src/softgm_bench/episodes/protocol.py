@@ -20,7 +20,7 @@ def whole_from_one(name: str, value: Any, *, optional: bool = False) -> None:
     Raises:
         UserError: with the name and the value.
     """
-    if (value is None and optional) or (isinstance(value, Integral) and value >= 1):
+    if (value is None and optional) or (isinstance(value, Integral) and int(value) >= 1):
         return
     raise UserError(f"{name}={value}: it must be at least 1, a whole number")
 
@@ -31,7 +31,7 @@ def check_seed(seed: Any) -> None:
     Raises:
         UserError: saying what one is.
     """
-    if not (isinstance(seed, Integral) and 0 <= seed < 2**63):
+    if not (isinstance(seed, Integral) and 0 <= int(seed) < 2**63):
         raise UserError(f"seed={seed}: a seed is a whole number from 0 to 2**63 - 1")
 
 
