@@ -22,6 +22,7 @@ from types import FrameType
 
 from softgm_bench.config import available_threads, compose
 from softgm_bench.config.explain import USER_ERRORS, explain
+from softgm_bench.runs.interruption import STOPPING, heeded
 from softgm_bench.storage.versions import versions
 from softgm_bench.sweeps import campaign, devices
 from softgm_bench.sweeps.packing import Pack, piece
@@ -57,7 +58,8 @@ def main() -> int:
     options = arguments()
     began = time.monotonic()
     end = began + 60.0 * options.minutes - options.reserve
-    signal.signal(signal.SIGTERM, interrupt)
+    for number in heeded(STOPPING):
+        signal.signal(number, interrupt)
     try:
         overrides = [*options.first, *([f"+grids={options.grid}"] if options.grid else []), *options.settings]
         done = [name for folder in options.done for name in campaign.finished(folder)]

@@ -116,6 +116,21 @@ def test_mistakes_are_explained(run):
         api.evaluate(api.load(run.folder), "task=basic", episodes=1)
 
 
+@pytest.mark.parametrize("wrong", [0, -1, 2.5, "many"])
+def test_counts_that_are_none_are_one_line(run, wrong):
+    for call in (
+        lambda: api.evaluate(run.folder, episodes=wrong, horizon=1),
+        lambda: api.evaluate(run.folder, episodes=1, horizon=wrong),
+        lambda: api.make_env(num_envs=wrong),
+        lambda: api.make_env(horizon=wrong),
+        lambda: api.rollout(api.make_env("rod.n_elements=20"), steps=wrong),
+    ):
+        with pytest.raises(UserError, match=rf"^(episodes|horizon|num_envs|steps)={wrong}: it must be at least 1"):
+            call()
+    with pytest.raises(UserError, match=r"^seed=-1: a seed is a whole number"):
+        api.make_env(seed=-1)
+
+
 def test_importing_the_package_does_not_wait_for_torch():
     code = "import sys, softgm_bench; print('torch' in sys.modules, 'hydra' in sys.modules)"
 

@@ -95,7 +95,9 @@ def test_a_sweep_runs_every_job_and_reports_each_that_fails(tmp_path):
     assert sorted(path.name for path in (tmp_path / "outputs").iterdir()) == ["basic", "multirun.yaml"]
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129), (signal.SIGUSR1, 138)]
+)
 def test_an_interrupted_run_says_where_its_checkpoint_is(tmp_path, number, code):
     from softgm_bench.runs import checkpoint
 
@@ -118,3 +120,12 @@ def test_an_interrupted_run_says_where_its_checkpoint_is(tmp_path, number, code)
     assert last.endswith(str(path.relative_to(tmp_path)))
     state = checkpoint.load(path)
     assert state["frames"] == 8 * state["counters"]["iteration"] == 8 * (metrics.read_text().count("\n") - 1)
+
+
+def test_a_run_that_nobody_reads_comes_to_its_end(tmp_path):
+    command_line = " ".join(f"'{word}'" for word in command(*TINY))
+    result = subprocess.run(["bash", "-c", f"{command_line} 2>&1 >/dev/full | head -c 1"], cwd=tmp_path, check=False)
+    assert result.returncode == 0
+    assert (tmp_path / "outputs/basic/softgm/seed0/summary.json").exists()
+    closed = subprocess.run(["bash", "-c", f"{command_line} overwrite=true >&- 2>&-"], cwd=tmp_path, check=False)
+    assert closed.returncode == 0

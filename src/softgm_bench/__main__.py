@@ -11,11 +11,12 @@ import hydra
 from hydra._internal.utils import get_args_parser
 from omegaconf import DictConfig
 
-from softgm_bench import process
+from softgm_bench import output, process
 from softgm_bench.config import composing, config_directory, typed
 from softgm_bench.config.explain import USER_ERRORS, explain
 from softgm_bench.console import COMMANDS, HELP, VERSION, completions
 from softgm_bench.errors import UserError
+from softgm_bench.runs import interruption as signals
 from softgm_bench.sweeps import cell as sweep_cell
 from softgm_bench.sweeps import launch as sweep
 
@@ -54,6 +55,11 @@ def main() -> int:
 def _train() -> int:
     process.prepare()
     process.quieten()
+    with output.unbreakable():
+        return _main()
+
+
+def _main() -> int:
     debugging = os.environ.get("HYDRA_FULL_ERROR") == "1"
     os.environ["HYDRA_FULL_ERROR"] = "1"  # let errors through instead of printing and leaving
     try:
@@ -129,7 +135,8 @@ def _sweep(arguments: Any) -> int:
         received = number
         raise KeyboardInterrupt
 
-    signal.signal(signal.SIGTERM, interrupt)
+    for number in signals.heeded(signals.STOPPING):
+        signal.signal(number, interrupt)
     try:
         with sweep.reported(plan) as outcomes:
             _hydra(sweep_cell.run)

@@ -24,7 +24,7 @@ from softgm_bench.episodes import folder as evaluation_folder
 from softgm_bench.episodes import policy, recording
 from softgm_bench.episodes.evaluation import DISCOUNT, EpisodeRecords
 from softgm_bench.episodes.policy import TrainedPolicy
-from softgm_bench.episodes.protocol import Protocol
+from softgm_bench.episodes.protocol import Protocol, check_seed, whole_from_one
 from softgm_bench.episodes.summary import summarise, table
 from softgm_bench.episodes.trajectory import Trajectory
 from softgm_bench.errors import UserError
@@ -78,6 +78,9 @@ def make_env(*overrides: str, num_envs: int = 1, seed: int = 0, horizon: int | N
         seed: of everything that the environments draw.
         horizon: control steps of an episode; None: the task's own.
     """
+    whole_from_one("num_envs", num_envs)
+    whole_from_one("horizon", horizon, optional=True)
+    check_seed(seed)
     return build_env(configure(*overrides), num_envs, seed, horizon)
 
 
@@ -134,6 +137,7 @@ def rollout(
         steps: control steps.
         deterministic: act by the mode of the policy, otherwise by a sample.
     """
+    whole_from_one("steps", steps)
     module = trained.policy if isinstance(trained, TrainedPolicy) else trained
     with torch.no_grad(), set_exploration_type(_exploration(deterministic)):
         return env.rollout(steps, module, break_when_any_done=False)

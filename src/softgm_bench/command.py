@@ -12,9 +12,10 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from softgm_bench import process
+from softgm_bench import output, process
 from softgm_bench.config import CHANGEABLE
 from softgm_bench.config.explain import USER_ERRORS, explain
+from softgm_bench.config.numbers import check_finite
 from softgm_bench.errors import UserError
 
 Options = TypeVar("Options")
@@ -33,7 +34,11 @@ def run(name: str, text: str | None, body: Callable[[list[str]], None]) -> int:
     """
     process.prepare()
     process.quieten()
-    arguments = sys.argv[1:]
+    with output.unbreakable():
+        return _run(name, text, body, sys.argv[1:])
+
+
+def _run(name: str, text: str | None, body: Callable[[list[str]], None], arguments: list[str]) -> int:
     if {"-h", "--help"} & set(arguments):
         print((text or "").strip().replace("``", ""))
         return 0
@@ -65,7 +70,7 @@ def parse(
         The path, the options, and the policy's settings as they were written.
 
     Raises:
-        UserError: no path or several, an unknown setting, or a value of the wrong type.
+        UserError: no path or several, an unknown setting, a value of the wrong type, or a number that is not finite.
     """
     paths = [argument for argument in arguments if "=" not in argument or Path(argument).exists()]
     if len(paths) != 1 or paths[0].startswith("-"):
@@ -89,4 +94,5 @@ def parse(
         raise UserError(f"{', '.join(own)}: a value that cannot be read") from error
     except OmegaConfBaseException as error:
         raise UserError(f"{error.full_key}: {str(error).splitlines()[0]}") from error
+    check_finite(OmegaConf.to_container(merged))
     return Path(paths[0]), cast(Options, OmegaConf.to_object(merged)), rest

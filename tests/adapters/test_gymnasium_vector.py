@@ -1,12 +1,14 @@
 """The Gymnasium adapters keep Gymnasium's contract and repeat ``SoftArmEnv`` bit by bit."""
 
+import copy
+
 import gymnasium
 import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from gymnasium.wrappers.vector import RecordEpisodeStatistics
+from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics
 
 from softgm_bench.adapters.gymnasium_vector import SoftArmGymnasiumEnv, SoftArmVectorEnv, register
 from softgm_bench.envs import entries, make_env
@@ -159,3 +161,93 @@ def test_what_cannot_be_is_refused_in_one_line():
             env.step(action + np.inf)
     with pytest.raises(ValueError, match="reset_mask"):
         SoftArmVectorEnv("basic", 2).reset(options={"reset_mask": np.array([True, False])})
+
+
+def scene(env):
+    return env._arm.scene.target.numpy().copy()
+
+
+@pytest.mark.parametrize("kind", [SoftArmGymnasiumEnv, SoftArmVectorEnv])
+def test_copies_of_an_unseeded_environment_play_scenes_of_their_own(kind):
+    env = kind("basic", overrides=[QUICK])
+    others = [copy.deepcopy(env) for _ in range(2)]
+    for one in (env, *others):
+        one.reset()
+    assert len({tuple(scene(one).ravel()) for one in (env, *others)}) == 3
+    seeded = kind("basic", seed=3, overrides=[QUICK])
+    again = copy.deepcopy(seeded)
+    assert data_equivalence(seeded.reset(), again.reset())
+    assert data_equivalence(env.reset(seed=3), kind("basic", seed=3, overrides=[QUICK]).reset())
+
+
+def test_seeds_of_each_environment_give_the_scenes_of_environments_alone():
+    env = SoftArmVectorEnv("basic", 3, overrides=[QUICK])
+    observation, _ = env.reset(seed=[5, 1, 5])
+    alone = [SoftArmGymnasiumEnv("basic", seed, overrides=[QUICK]).reset()[0] for seed in (5, 1, 5)]
+    assert np.array_equal(observation, np.stack(alone))
+    later = env.reset()[0]
+    assert np.array_equal(env.reset(seed=[5, 1, 5])[0], observation)
+    assert np.array_equal(env.reset()[0], later)
+    env.reset(seed=[5, None, 2])
+    with pytest.raises(ValueError, match=r"^seed has 2 numbers: it must be one, or one for each of 3$"):
+        env.reset(seed=[1, 2])
+
+
+def test_an_episode_begins_again_in_the_next_step_where_that_is_asked_for():
+    task, horizon, overrides = EASY
+    same = SoftArmVectorEnv(task, ENVS, 3, horizon, overrides)
+    later = SoftArmVectorEnv(task, ENVS, 3, horizon, overrides, autoreset_mode=AutoresetMode.NEXT_STEP)
+    assert np.array_equal(same.reset()[0], later.reset()[0])
+    ended = np.zeros(ENVS, dtype=bool)
+    begun = 0
+    for action in actions_for(later, 20):
+        observation, reward, terminated, truncated, infos = later.step(action)
+        assert (reward[ended] == 0.0).all()
+        assert not (terminated | truncated)[ended].any()
+        begun += ended.sum()
+        ended = terminated | truncated
+        assert np.isfinite(observation).all()
+        assert infos["distance"].shape == (ENVS,)
+    assert begun > ENVS
+    assert same.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
+    with pytest.raises(ValueError, match="autoreset_mode is"):
+        SoftArmVectorEnv(task, ENVS, autoreset_mode=AutoresetMode.DISABLED)
+
+
+def test_gymnasium_s_normalising_wrapper_works():
+    register()
+    env = gymnasium.make_vec(
+        "SoftArm-basic-v0",
+        num_envs=3,
+        vectorization_mode="vector_entry_point",
+        autoreset_mode=AutoresetMode.NEXT_STEP,
+        horizon=4,
+        overrides=[QUICK],
+    )
+    normal = NormalizeObservation(env)
+    normal.reset(seed=[1, 2, 3])
+    for action in actions_for(normal, 9):
+        observation, *_ = normal.step(action)
+    assert np.abs(observation).max() < 10.0
+
+
+def test_pictures_are_those_of_the_arm():
+    """Stable-Baselines3's ``make_vec_env`` asks every environment for them."""
+    register()
+    env = gymnasium.make("SoftArm-basic-v0", render_mode="rgb_array", overrides=[QUICK], horizon=5)
+    env.reset(seed=0)
+    first = env.render()
+    env.step(np.ones(env.action_space.shape, dtype=np.float32))
+    assert first.shape == (480, 640, 3)
+    assert not np.array_equal(env.render(), first)
+    assert SoftArmGymnasiumEnv("basic").render() is None
+
+
+def test_stable_baselines_makes_and_steps_it():
+    env_util = pytest.importorskip("stable_baselines3.common.env_util")
+    register()
+    envs = env_util.make_vec_env("SoftArm-basic-v0", 2, seed=0, env_kwargs={"overrides": [QUICK], "horizon": 3})
+    envs.reset()
+    for action in actions_for(SoftArmGymnasiumEnv("basic"), 4):
+        observation, *_ = envs.step(np.stack([action] * 2))
+    assert observation.shape[0] == 2

@@ -1,5 +1,6 @@
 """The PettingZoo adapter keeps PettingZoo's contract and repeats ``SoftArmEnv`` bit by bit."""
 
+import copy
 import sys
 
 import numpy as np
@@ -299,3 +300,39 @@ def test_steps_that_cannot_be_are_refused():
     env.step(actions)
     with pytest.raises(ValueError, match=r"reset\(\)"):
         env.step({})
+
+
+def test_copies_of_an_unseeded_environment_play_scenes_of_their_own():
+    env = parallel_env("basic", overrides=["rod.substeps=10"])
+    other = copy.deepcopy(env)
+    seeded = [parallel_env("basic", 3, overrides=["rod.substeps=10"]), copy.deepcopy(env)]
+    targets = [one.reset() and one.arm.scene.target.numpy().copy() for one in (env, other)]
+    assert not np.array_equal(*targets)
+    assert np.array_equal(seeded[0].reset()[0]["section_0"], seeded[1].reset(seed=3)[0]["section_0"])
+
+
+def test_wrappers_that_go_on_with_dead_agents_or_draw_numbers_find_what_they_need():
+    """As SuperSuit's black death and frame skip do."""
+    env = parallel_env("basic", overrides=[QUICK], horizon=2)
+    with pytest.raises(ValueError, match="call reset"):
+        env.step({})
+    env.reset(seed=5)
+    drawn = env.np_random.integers(1000)
+    while env.agents:
+        env.step({agent: np.zeros(2, dtype=np.float32) for agent in env.agents})
+    assert env.step({}) == ({}, {}, {}, {}, {})
+    env.reset(seed=5)
+    assert env.np_random.integers(1000) == drawn
+
+
+@pytest.mark.parametrize("name", ["frame_skip_v0", "black_death_v3"])
+def test_supersuit_comes_to_an_end(name):
+    supersuit = pytest.importorskip("supersuit")
+    wrap = {"frame_skip_v0": lambda env: supersuit.frame_skip_v0(env, 3), "black_death_v3": supersuit.black_death_v3}
+    env = wrap[name](parallel_env("basic", overrides=[QUICK], horizon=7))
+    env.reset(seed=0)
+    steps = 0
+    while env.agents and steps < 20:
+        env.step({agent: env.action_space(agent).sample() for agent in env.agents})
+        steps += 1
+    assert steps == {"frame_skip_v0": 3, "black_death_v3": 8}[name]

@@ -60,6 +60,7 @@ def test_the_chosen_step_is_drawn(monkeypatch, recorded, tmp_path):
     [
         ((), "out: name a file"),
         (("out=a.bmp",), "a.bmp: its name must end in one of .png"),
+        (("out=a,b.png",), "out=a,b.png: commas stand between files, and a ends in none of .png"),
         (("out=a.png", "width=5"), "width is 5"),
         (("out=a.mp4", "height=49"), "height is 49: an MP4 video needs an even number"),
         (("out=a.mp4", "speed=-1"), "speed is -1.0: it must be above 0"),

@@ -259,7 +259,7 @@ def test_if_all_checkpoints_are_damaged_nothing_is_lost(broken):
         path.write_bytes(b"")
     before = {path: path.read_bytes() for path in broken.rglob("*") if path.is_file()}
 
-    with pytest.raises(UserError, match=r"no checkpoint here is whole; to begin anew, give overwrite=true[^\n]*$"):
+    with pytest.raises(UserError, match=r"no checkpoint here can be used; to begin anew, give overwrite=true[^\n]*$"):
         train(broken, *SMALL, "resume=true")
     assert before == {path: path.read_bytes() for path in broken.rglob("*") if path.is_file()}
 

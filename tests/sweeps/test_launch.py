@@ -154,3 +154,11 @@ def test_a_cell_that_leaves_no_word_is_not_taken_for_done(tmp_path, capsys):
 
 def test_jobs_of_a_named_grid_are_counted_without_composing_them():
     assert sweep.plan(["+grids=table1", "task=basic"]).jobs == 21
+
+
+def test_a_glob_is_the_names_that_fit_it():
+    found, _ = sweep.cells(["task=glob(b*)", "seed=0,1"])
+    assert [cell.overrides for cell in found] == [("task=basic", "seed=0"), ("task=basic", "seed=1")]
+    assert sweep.plan(["task=glob(wall*)", "algo=ippo"]).jobs == 3
+    with pytest.raises(UserError, match=r"^task=glob\(zz\*\): nothing in conf/task fits it$"):
+        sweep.cells(["task=glob(zz*)"])

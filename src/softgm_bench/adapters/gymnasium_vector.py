@@ -18,6 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 from tensordict import TensorDictBase
 
 from softgm_bench import plugins
+from softgm_bench.adapters.film import RENDER_MODES, Film, check_render_mode
 from softgm_bench.assembly import build_env, configure
 from softgm_bench.envs import entries
 from softgm_bench.envs.soft_arm import SoftArmEnv
@@ -36,7 +37,7 @@ def build_arm(
     Args:
         task: a name in ``TASKS``.
         num_envs: environments simulated at once.
-        seed: of the scenes; None: from the operating system, as is usual in Gymnasium.
+        seed: of the scenes; None: the adapter gives one from the operating system in its first reset (``Seeding``).
         horizon: control steps until truncation, the task's by default.
         overrides: settings as on the command line, of ``SETTINGS`` only.
 
@@ -57,14 +58,31 @@ def build_arm(
             raise ValueError(
                 f"overrides holds {override!r}: settings of {', '.join(SETTINGS)}; the task is an argument"
             )
-    if seed is None:
-        (word,) = np.random.SeedSequence().generate_state(1, np.uint64)
-        seed = int(word >> np.uint64(1))
     try:
         config = configure([f"task={task}", *overrides])
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(_one_line(error)) from error
-    return build_env(config, num_envs, checked_seed(seed), horizon)
+    return build_env(config, num_envs, 0 if seed is None else checked_seed(seed), horizon)
+
+
+class Seeding:
+    """Which seed a reset begins with, so that one seed means one set of scenes wherever it is given.
+
+    An environment that nobody has seeded draws from the operating system in its first reset and not before: copies of
+    one, as vector wrappers make them, then play scenes of their own.
+    """
+
+    def __init__(self, seed: int | None) -> None:
+        """Note the seed that the environment was built with."""
+        self._open = seed is None
+
+    def __call__(self, seed: int | None) -> int | None:
+        """Give the seed to set now, for what ``reset`` was given; None: go on drawing as before."""
+        if seed is None and self._open:
+            (word,) = np.random.SeedSequence().generate_state(1, np.uint64)
+            seed = int(word >> np.uint64(1))
+        self._open = False
+        return None if seed is None else checked_seed(seed)
 
 
 def checked_seed(seed: int) -> int:
@@ -145,7 +163,7 @@ class SoftArmGymnasiumEnv(gymnasium.Env[Array, Array]):
     is over does not move until ``reset``.
     """
 
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012
+    metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES)}  # noqa: RUF012
 
     def __init__(
         self,
@@ -155,19 +173,23 @@ class SoftArmGymnasiumEnv(gymnasium.Env[Array, Array]):
         overrides: Sequence[str] = (),
         render_mode: str | None = None,
     ) -> None:
-        """Build the environment; arguments as of ``build_arm``. Nothing is rendered here: see ``parallel_env``."""
-        _refuse_rendering(render_mode)
-        self._arm = build_arm(task, 1, seed, horizon, overrides)
+        """Build the environment; arguments as of ``build_arm``; ``render_mode``: ``rgb_array`` or None."""
+        check_render_mode(render_mode)
+        self._arm, self._seeding = build_arm(task, 1, seed, horizon, overrides), Seeding(seed)
         self.observation_space = real_space(joint_size(self._arm))
         self.action_space = spaces.Box(-1.0, 1.0, (action_size(self._arm),), np.float32)
+        self.render_mode = render_mode
+        self.metadata = {**self.metadata, "render_fps": 1.0 / self._arm.backend.parameters.control_dt}
+        self._film = None if render_mode is None else Film(self._arm)
         self._td: TensorDictBase | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
         """Begin an episode; with a seed, the same one each time."""
-        if seed is not None:
-            self._arm.set_seed(checked_seed(seed))
+        drawn_from = self._seeding(seed)
         super().reset(seed=seed)
-        self._td = self._arm.reset()
+        self._td = self._arm.reset(seed=drawn_from)
+        if self._film is not None:
+            self._film.begin(self._td)
         return joint_view(self._td)[0], info_row(info_columns(self._td), 0)
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
@@ -176,15 +198,25 @@ class SoftArmGymnasiumEnv(gymnasium.Env[Array, Array]):
             raise ValueError("step before the first reset: call reset()")
         checked = checked_action(action, (action_size(self._arm),))
         self._td = td = self._arm.step(put_action(self._td, checked, self._arm))["next"]
+        if self._film is not None:
+            self._film.step(td)
         reward, terminated, truncated = ends(td)
         return joint_view(td)[0], reward, terminated, truncated, info_row(info_columns(td), 0)
+
+    def render(self) -> Array | None:
+        """Draw the arm as it stands, ``(height, width, 3)`` uint8; None without a ``render_mode``."""
+        if self._film is None or self._td is None:
+            return None
+        return self._film.picture()
 
 
 class SoftArmVectorEnv(VectorEnv[Array, Array, Array]):
     """``num_envs`` arms in one simulation, each of its own one agent as in ``SoftArmGymnasiumEnv``.
 
     An episode that ends begins again in the same step (``AutoresetMode.SAME_STEP``): the observation is the new
-    episode's first, ``infos["final_obs"]`` and ``infos["final_info"]`` hold the last of the old one.
+    episode's first, ``infos["final_obs"]`` and ``infos["final_info"]`` hold the last of the old one. With
+    ``AutoresetMode.NEXT_STEP``, which Gymnasium's normalising wrappers ask for, it begins in the step after, whose
+    action is not heeded and whose reward is 0.
     """
 
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012
@@ -197,10 +229,16 @@ class SoftArmVectorEnv(VectorEnv[Array, Array, Array]):
         horizon: int | None = None,
         overrides: Sequence[str] = (),
         render_mode: str | None = None,
+        autoreset_mode: AutoresetMode = AutoresetMode.SAME_STEP,
     ) -> None:
-        """Build the environments; arguments as of ``build_arm``."""
+        """Build the environments; arguments as of ``build_arm``, and when an episode that has ended begins again."""
         _refuse_rendering(render_mode)
-        self._arm = build_arm(task, num_envs, seed, horizon, overrides)
+        modes = (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP)
+        if autoreset_mode not in modes:
+            raise ValueError(f"autoreset_mode is {autoreset_mode!r}: choose {' or '.join(map(str, modes))}")
+        self.metadata = {**self.metadata, "autoreset_mode": autoreset_mode}
+        self._ended: NDArray[np.bool_] | None = None  # episodes that begin again in the next step; None: none waits
+        self._arm, self._seeding = build_arm(task, num_envs, seed, horizon, overrides), Seeding(seed)
         self.num_envs = num_envs
         self.single_observation_space = real_space(joint_size(self._arm))
         self.single_action_space = spaces.Box(-1.0, 1.0, (action_size(self._arm),), np.float32)
@@ -208,22 +246,50 @@ class SoftArmVectorEnv(VectorEnv[Array, Array, Array]):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._td: TensorDictBase | None = None
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
-        """Begin an episode in every environment; ``seed`` is of all of them together."""
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Array, dict[str, Any]]:
+        """Begin an episode in every environment.
+
+        Args:
+            seed: of all environments together; or one for each, whose first scene is then that of an environment alone
+                with this seed.
+            options: nothing.
+        """
         if options is not None and "reset_mask" in options:
             raise ValueError("options holds reset_mask: episodes begin again by themselves, in the step that ends them")
-        if seed is not None:
-            self._arm.set_seed(checked_seed(seed))
-        super().reset(seed=seed)
-        self._td = self._arm.reset()
-        everywhere = np.ones(self.num_envs, dtype=bool)
+        if seed is None or isinstance(seed, int | np.integer):
+            drawn_from = self._seeding(seed)
+            super().reset(seed=seed)
+            self._td = self._arm.reset(seed=drawn_from)
+        else:
+            self._td = self._reset_each(list(seed))
+        everywhere, self._ended = np.ones(self.num_envs, dtype=bool), None
         return joint_view(self._td), _masked(info_columns(self._td), everywhere)
+
+    def _reset_each(self, seeds: Sequence[int | None]) -> TensorDictBase:
+        """Begin every environment's episode with its own seed; what is drawn later belongs to all seeds together."""
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"seed has {len(seeds)} numbers: it must be one, or one for each of {self.num_envs}")
+        own = [seed for seed in (Seeding(seed)(seed) for seed in seeds) if seed is not None]
+        (together,) = np.random.SeedSequence(own).generate_state(1)
+        super().reset(seed=int(together))
+        td = self._arm.reset()
+        for row, seed in enumerate(own):
+            mask = torch.zeros_like(td[entries.DONE])
+            mask[row] = True
+            td = self._arm.reset(td.clone().set("_reset", mask), seed=seed)
+        self._seeding(int(together))
+        self._arm.set_seed(int(together))
+        return td
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """One control step of every environment."""
         if self._td is None:
             raise ValueError("step before the first reset: call reset()")
         checked = checked_action(actions, (self.num_envs, action_size(self._arm)))
+        if self.metadata["autoreset_mode"] == AutoresetMode.NEXT_STEP:
+            return self._step_and_wait(checked)
         frame, self._td = self._arm.step_and_maybe_reset(put_action(self._td, checked, self._arm))
         last = frame["next"]
         reward, terminated, truncated = (
@@ -239,6 +305,20 @@ class SoftArmVectorEnv(VectorEnv[Array, Array, Array]):
             infos |= {"final_obs": final, "_final_obs": done.copy()}
             infos |= {"final_info": _masked(info_columns(last), done), "_final_info": done.copy()}
         return joint_view(self._td), reward.astype(np.float64), terminated.copy(), truncated.copy(), infos
+
+    def _step_and_wait(self, action: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
+        """One step in which what had ended before begins again, and what ends now stays as it is."""
+        assert self._td is not None
+        td = self._arm.step(put_action(self._td, action, self._arm))["next"]
+        reward = td[entries.REWARD].squeeze(-1).cpu().numpy().astype(np.float64)
+        if self._ended is not None and self._ended.any():
+            mask = torch.as_tensor(self._ended, device=self._arm.device).unsqueeze(-1)
+            td = self._arm.reset(td.clone().set("_reset", mask))
+            reward[self._ended] = 0.0
+        terminated, truncated = (td[key].squeeze(-1).cpu().numpy() for key in (entries.TERMINATED, entries.TRUNCATED))
+        self._td, self._ended = td, terminated | truncated
+        infos = _masked(info_columns(td), np.ones_like(self._ended))
+        return joint_view(td), reward, terminated.copy(), truncated.copy(), infos
 
 
 def register() -> None:

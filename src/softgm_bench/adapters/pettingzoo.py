@@ -1,7 +1,6 @@
 """The arm as a PettingZoo environment: one agent per section, one environment."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
 from typing import Any, TypeAlias
 
 import gymnasium
@@ -14,10 +13,11 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded
 
+from softgm_bench.adapters.film import RENDER_MODES, Film, check_render_mode
 from softgm_bench.adapters.gymnasium_vector import (
+    Seeding,
     build_arm,
     checked_action,
-    checked_seed,
     ends,
     info_columns,
     info_row,
@@ -32,9 +32,6 @@ from softgm_bench.envs.views import flat_features, flat_observation
 
 Array = NDArray[Any]
 Observation = Array | dict[str, Array]
-RENDER_MODES = ("rgb_array",)
-WIDTH, HEIGHT = 640, 480  # of pictures, pixels
-VIEW_DISTANCE = 5.0  # of the camera, in lengths of the arm: in the picture unless it hangs straight down
 
 
 def parallel_env(
@@ -60,84 +57,8 @@ def parallel_env(
     """
     if observation not in _VIEWS:
         raise ValueError(f"observation is {observation!r}: choose one of {', '.join(_VIEWS)}")
-    if render_mode is not None and render_mode not in RENDER_MODES:
-        raise ValueError(f"render_mode is {render_mode!r}: choose {', '.join(RENDER_MODES)} or None")
-    return SoftArmParallelEnv(build_arm(task, 1, seed, horizon, overrides), observation, render_mode)
-
-
-class _Film:
-    """An episode until now, for the renderer: it draws the tip's path and when obstacles were discovered."""
-
-    def __init__(self, arm: SoftArmEnv) -> None:
-        self._arm = arm
-        self._states: dict[str, list[Array]] = {}
-        self._steps: dict[str, list[Array]] = {}
-        self._camera: Any = None  # of the episode: what stands still shall do so in the pictures
-        self._td: TensorDictBase | None = None
-
-    def begin(self, td: TensorDictBase) -> None:
-        """Forget everything and note the state after a reset."""
-        self._states, self._camera, self._td = {}, None, td
-        self._steps = {"action": [], "tip_force": [], "reward": []}
-        self._note_state(td)
-
-    def step(self, td: TensorDictBase) -> None:
-        """Note what a step led to."""
-        self._steps["action"].append(_first_row(self._arm.applied_action))
-        self._steps["tip_force"].append(_first_row(self._arm.tip_force).astype(np.float64))
-        self._steps["reward"].append(_first_row(td[entries.REWARD])[0])
-        self._td = td
-        self._note_state(td)
-
-    def picture(self) -> Array:
-        """The last state, ``(height, width, 3)`` uint8."""
-        try:
-            from softgm_bench.render.still import PictureSettings, Studio
-        except ImportError as error:
-            raise ImportError("rendering is not installed: pip install '.[render]'") from error
-        trajectory = self._trajectory()
-        distance = VIEW_DISTANCE * self._arm.backend.parameters.base_length
-        studio = Studio(trajectory, PictureSettings(WIDTH, HEIGHT, distance=distance))
-        if self._camera is None:
-            self._camera = studio.camera
-        studio.camera = self._camera
-        return studio.picture(trajectory.steps)
-
-    def _note_state(self, td: TensorDictBase) -> None:
-        rod = self._arm.rod
-        now = {name: getattr(rod, name) for name in ("position", "director", "velocity", "omega")}
-        now |= {"contact": self._arm.contacts()}
-        now |= {"slots/active": td[entries.SLOT_ACTIVE], "slots/descriptor": td[entries.SLOT_DESCRIPTOR]}
-        for name, values in now.items():
-            self._states.setdefault(name, []).append(_first_row(values))
-
-    def _trajectory(self) -> Any:
-        from softgm_bench.episodes.trajectory import CYLINDER_FIELDS, Trajectory
-
-        assert self._td is not None
-        arm, cylinders = self._arm, self._arm.scene.cylinders
-        exists = _first_row(cylinders.mask)
-        states = {name: np.stack(values) for name, values in self._states.items()}
-        steps = len(self._steps["reward"])
-        shapes = {"action": (steps, arm.sizes.n_agents, arm.sizes.action), "tip_force": (steps, 3), "reward": (steps,)}
-        return Trajectory(
-            observation={name: states.pop(name) for name in tuple(states) if "/" in name},
-            **states,
-            **{name: np.array(values).reshape(shapes[name]) for name, values in self._steps.items()},
-            target=_first_row(arm.scene.target).astype(np.float64),
-            reward_terms={},
-            cylinders={name: _first_row(getattr(cylinders, name))[exists].astype(float) for name in CYLINDER_FIELDS},
-            attention={},
-            success=bool(self._td[entries.SUCCESS]),
-            diverged=bool(self._td[entries.DIVERGED]),
-            config={"rod": asdict(arm.backend.parameters), "task": asdict(arm.task.config)},
-            info={},
-        )
-
-
-def _first_row(values: Tensor) -> Array:
-    """Of the only environment, an array of its own."""
-    return values[0].cpu().numpy().copy()
+    check_render_mode(render_mode)
+    return SoftArmParallelEnv(build_arm(task, 1, seed, horizon, overrides), observation, render_mode, seed)
 
 
 class SoftArmParallelEnv(ParallelEnv[str, Observation, Array]):
@@ -147,9 +68,9 @@ class SoftArmParallelEnv(ParallelEnv[str, Observation, Array]):
     and are gone then until ``reset``. ``step`` needs an action of every agent; what lies outside of [-1, 1] is clipped.
     """
 
-    def __init__(self, arm: SoftArmEnv, observation: str, render_mode: str | None) -> None:
-        """Wrap an environment with ``num_envs`` 1; use ``parallel_env``."""
-        self.arm = arm
+    def __init__(self, arm: SoftArmEnv, observation: str, render_mode: str | None, seed: int | None = None) -> None:
+        """Wrap an environment with ``num_envs`` 1 that was built with ``seed``; use ``parallel_env``."""
+        self.arm, self._seeding = arm, Seeding(seed)
         self.render_mode = render_mode
         self.metadata = {
             "name": "soft_arm_v0",
@@ -164,8 +85,9 @@ class SoftArmParallelEnv(ParallelEnv[str, Observation, Array]):
         own = (arm.sizes.action,)
         self.action_spaces = {agent: spaces.Box(-1.0, 1.0, own, np.float32) for agent in self.possible_agents}
         self.state_space = real_space(joint_size(arm))
-        self._film = None if render_mode is None else _Film(arm)
+        self._film = None if render_mode is None else Film(arm)
         self._td: TensorDictBase | None = None
+        self.np_random = np.random.default_rng(seed)  # for wrappers, such as SuperSuit's; nothing here draws from it
 
     def observation_space(self, agent: str) -> spaces.Space:
         """Give one agent's space; the same object each time, so that it can be seeded."""
@@ -179,9 +101,10 @@ class SoftArmParallelEnv(ParallelEnv[str, Observation, Array]):
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Observation], dict[str, dict[str, Any]]]:
         """Begin an episode; with a seed, the same one each time. There are no options."""
-        if seed is not None:
-            self.arm.set_seed(checked_seed(seed))
-        self._td = self.arm.reset()
+        drawn_from = self._seeding(seed)
+        if drawn_from is not None:
+            self.np_random = np.random.default_rng(drawn_from)
+        self._td = self.arm.reset(seed=drawn_from)
         self.agents = list(self.possible_agents)
         if self._film is not None:
             self._film.begin(self._td)
@@ -195,6 +118,8 @@ class SoftArmParallelEnv(ParallelEnv[str, Observation, Array]):
         Raises:
             ValueError: there is no episode under way, or the actions are not one finite ``(2,)`` for each agent.
         """
+        if self._td is not None and not self.agents and not actions:
+            return {}, {}, {}, {}, {}  # wrappers that keep dead agents (SuperSuit's black death) do not stop here
         if self._td is None or not self.agents:
             raise ValueError("step outside of an episode: call reset()")
         if set(actions) != set(self.agents):

@@ -123,7 +123,7 @@ class Explorer(TensorDictModuleBase):
         explores = exploration_type() is ExplorationType.RANDOM
         if explores and self.uniform:
             agents = td.get(self.in_keys[0])  # (..., N, any)
-            action = torch.empty((*agents.shape[:-1], self.actions), device=agents.device)
+            action = torch.empty((*agents.shape[:-1], self.actions), dtype=torch.float32, device=agents.device)
             return td.set(entries.ACTION, action.uniform_(-1.0, 1.0))
         action = self.actor(td.copy()).get(entries.ACTION)
         return td.set(entries.ACTION, self.explore(action, td) if explores else action)

@@ -7,6 +7,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
 from softgm_bench.envs.interface import Environment, Sizes
+from softgm_bench.upstream import default_dtype
 
 
 class Algorithm(Protocol):
@@ -31,7 +32,8 @@ class Algorithm(Protocol):
     def update(self, batch: TensorDictBase) -> dict[str, float]:
         """Learn from ``(num_envs, steps)`` consecutive frames of the current policy; returns metrics to write down.
 
-        The names of the metrics must be the same every time.
+        The names of the metrics must be the same every time. A run stops as diverged where one that begins with
+        ``loss_`` or ends in ``_grad_norm`` is not finite, unless ``gradient_steps`` among them is 0.
         """
 
     def state_dict(self) -> dict[str, Any]:
@@ -76,7 +78,8 @@ def build_algorithm(config: Any, model_config: Any, env: Environment, oracle: bo
     Raises:
         ValueError: if there is no such algorithm, or ``config`` is another one's.
     """
-    return _class_of(config)(config, model_config, env, oracle)
+    with default_dtype.float32():
+        return _class_of(config)(config, model_config, env, oracle)
 
 
 def build_policy(
@@ -94,7 +97,8 @@ def build_policy(
     Raises:
         ValueError: if there is no such algorithm, or ``config`` is another one's.
     """
-    return _class_of(config).build_policy(config, model_config, sizes, oracle, frames)
+    with default_dtype.float32():
+        return _class_of(config).build_policy(config, model_config, sizes, oracle, frames)
 
 
 def _class_of(config: Any) -> Any:

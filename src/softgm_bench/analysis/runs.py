@@ -135,13 +135,15 @@ def find(*roots: Path) -> Found:
             raise UserError(f"{root}: no such folder")
         for path, folders, files in os.walk(root.resolve()):
             folders[:] = sorted(name for name in folders if name != "checkpoints" and not name.startswith("."))
-            if {"summary.json", "config.yaml", "metrics.csv", "episodes.csv"} & set(files):
+            if {"summary.json", "config.yaml", "metrics.csv", "episodes.csv", "failure.json"} & set(files):
                 source = _read(RunFolder(Path(path)), Path(path).relative_to(root.resolve().parent).as_posix())
                 lists[type(source)].append(source)
     return found
 
 
 def _read(folder: RunFolder, name: str) -> Run | Evaluation | Problem:
+    if not folder.summary.exists() and folder.failure.exists():
+        return Problem(name, f"failed: {_failure(folder)}")
     if not folder.summary.exists():
         return Problem(name, f"unfinished: summary.json is missing{_how_far(folder)}")
     try:
@@ -153,6 +155,14 @@ def _read(folder: RunFolder, name: str) -> Run | Evaluation | Problem:
     except (ValueError, OSError, YAMLError, OmegaConfBaseException) as error:
         reason = str(error).splitlines()[0]
     return Problem(name, f"damaged: {reason}")
+
+
+def _failure(folder: RunFolder) -> str:
+    """Say why a run came to nothing, as far as it is known."""
+    try:
+        return " ".join(str(json.loads(folder.failure.read_text())["error"]).split())
+    except (OSError, ValueError, KeyError, TypeError):
+        return "failure.json is damaged"
 
 
 def _how_far(folder: RunFolder) -> str:
@@ -227,6 +237,8 @@ def _compare(episodes: Columns, metrics: Mapping[str, Any]) -> None:
     count = len(episodes["length"])
     if count != metrics["episodes"]:
         raise ValueError(f"episodes.csv has {count} episodes, summary.json {metrics['episodes']}")
+    if not np.isfinite(episodes["undiscounted_return"]).all():
+        raise ValueError("the returns are no numbers: the policy had diverged")
     mean = float(episodes["length"].mean())
     if not np.isclose(mean, metrics["episode_length"]["mean"], rtol=1e-9):
         raise ValueError("episodes.csv and summary.json differ in their mean episode length")

@@ -18,7 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from softgm_bench.config import resolvers
+from softgm_bench.config import numbers, resolvers
 from softgm_bench.config.schema import PAPER, RECIPES, Config, group_schemas, model_name
 from softgm_bench.config.upgrade import NEUTRAL, upgraded
 from softgm_bench.errors import UserError
@@ -34,10 +34,17 @@ ConfigStore.instance().store(group="rod", name="paper", node=asdict(RodParameter
 
 
 def config_directory() -> Path:
-    """Folder of the YAML files: inside an installed package, or at the top of the repository."""
+    """Folder of the YAML files: inside an installed package, or at the top of the repository.
+
+    Raises:
+        UserError: there is none.
+    """
     package = Path(__file__).resolve().parents[1]
     installed = package / "conf"
-    return installed if installed.is_dir() else package.parents[1] / "conf"
+    found = installed if installed.is_dir() else package.parents[1] / "conf"
+    if not found.is_dir():  # inside of an archive, where Hydra and Numba find nothing either
+        raise UserError(f"{package}: no folder with the settings beside it: install the wheel, pip install FILE.whl")
+    return found
 
 
 def compose(overrides: list[str]) -> Config:
@@ -76,7 +83,8 @@ def typed(composed: DictConfig) -> Config:
     """Hold a composed configuration, or one that was written down, against the dataclasses and make instances of them.
 
     Raises:
-        UserError: a name that stands for nothing, or a value that a dataclass refuses.
+        UserError: a name that stands for nothing, a number that is not finite, a range upside down, or a value that a
+            dataclass refuses.
         OmegaConfBaseException: a misspelt or missing key, a wrong type, or an interpolation that leads nowhere.
     """
     recipe = composed.get("recipe", NEUTRAL["recipe"])
@@ -93,6 +101,7 @@ def typed(composed: DictConfig) -> Config:
         if "name" not in get_type_hints(schemas[name]):
             del values[group]["name"]
     _fill(schema)
+    numbers.check_finite(OmegaConf.to_container(values), schema)
     try:
         config = OmegaConf.to_object(OmegaConf.merge(schema, values))
     except OmegaConfBaseException:
@@ -101,6 +110,7 @@ def typed(composed: DictConfig) -> Config:
         raise UserError(str(error)) from error
     assert isinstance(config, Config)
     _restore_tuples(config)
+    numbers.check_ranges(config)
     return config
 
 

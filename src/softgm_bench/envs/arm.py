@@ -1,6 +1,8 @@
 """The arm's tasks are played by ``SoftArmEnv``, built here from a run's settings."""
 
+import math
 from dataclasses import replace
+from typing import Any
 
 import torch
 
@@ -8,8 +10,12 @@ from softgm_bench.envs.interface import Kind, Settings, register_kind
 from softgm_bench.envs.perturbation import PerturbationConfig
 from softgm_bench.envs.soft_arm import SoftArmEnv, sizes_of
 from softgm_bench.envs.tasks import TASK_CONFIGS, TaskConfig, make_task
+from softgm_bench.rod import forks
 from softgm_bench.rod.backend import default_backend, make_backend
 from softgm_bench.rod.parameters import RodParameters
+from softgm_bench.rod.stability import check_time_step
+
+SCENES = 1024  # of a check
 
 
 def make_env(
@@ -53,12 +59,44 @@ def _build(settings: Settings, num_envs: int, seed: int, horizon: int | None, tr
 
 
 def _check(settings: Settings) -> None:
-    """Draw one scene on the CPU, where ranges that leave nothing show.
+    """Refuse time steps that are too long, and tasks that leave nothing to be drawn or draw what is out of reach.
+
+    Scenes are drawn on the CPU, where ranges that leave nothing show.
 
     Raises:
         ValueError: with one line naming the key, its value and what would be right.
     """
-    make_task(settings.task).sample(1, torch.Generator())
+    forks.check()  # before tensors are computed with
+    config, rod = settings.task, settings.rod
+    check_time_step(rod)
+    task, drawn = make_task(config), torch.Generator()
+    scenes = [task.sample(SCENES, drawn)]
+    if config.curriculum.enabled:
+        scenes.append(task.sample(SCENES, drawn, torch.zeros((), dtype=torch.float64)))
+    reach = rod.base_length + config.success_radius
+    furthest = max(float(scene.target.norm(dim=-1).max()) for scene in scenes)
+    if furthest > reach:
+        keys = ", ".join(f"task.{name}={list(value)}" for name, value in _targets(config).items())
+        raise ValueError(
+            f"rod.base_length={rod.base_length} with {keys or f'task={config.name}'}: targets lie up to "
+            f"{furthest:.2f} m from the base, the arm reaches {reach:.2f} m; bring them nearer or give "
+            f"rod.base_length={math.ceil(100 * furthest) / 100}"
+        )
+    if (tip := getattr(config, "resting_tip", None)) is not None and abs(tip[2] - rod.base_length) > 1e-9:
+        raise ValueError(
+            f"task.resting_tip={list(tip)} with rod.base_length={rod.base_length}: "
+            f"the arm's tip rests at {[0.0, 0.0, rod.base_length]}"
+        )
+    if rod.base_length < (way := getattr(config, "max_path", 0.0)) < math.inf:
+        raise ValueError(
+            f"task.max_path={way} with rod.base_length={rod.base_length}: no longer way can be gone by this arm; "
+            f"give task.max_path={0.92 * rod.base_length:.3g}"
+        )
+
+
+def _targets(config: TaskConfig) -> dict[str, Any]:
+    """Settings of a task that say where targets are."""
+    return {name: value for name, value in vars(config).items() if name.startswith("target_") and "angle" not in name}
 
 
 ARM = register_kind(

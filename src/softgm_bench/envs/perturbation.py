@@ -99,7 +99,7 @@ class Perturbation:
         self.seed(seed)
         works = [[agent not in config.failed_agents] for agent in range(n_agents)]
         self._works = torch.tensor(works, device=device)
-        self._silence = torch.zeros((), device=device)
+        self._silence = torch.zeros((), dtype=torch.float32, device=device)
 
     def seed(self, seed: int) -> None:
         """Begin the own stream of random numbers that belongs to an environment's seed; it is not the scenes'."""

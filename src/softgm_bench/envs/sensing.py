@@ -148,7 +148,7 @@ def _nothing(agent_position: Tensor, table: SlotTable) -> Sight:
     return Sight(
         table=table,
         new=torch.zeros_like(table.count),
-        descriptor=torch.zeros((*shape, 9), device=device),
+        descriptor=torch.zeros((*shape, 9), dtype=torch.float32, device=device),
         active=torch.zeros(shape, dtype=torch.bool, device=device),
         edge=torch.zeros((shape[0], agent_position.shape[1], shape[1]), dtype=torch.bool, device=device),
     )

@@ -10,6 +10,7 @@ import numba
 import numpy as np
 
 from softgm_bench.rod.callees import with_callees
+from softgm_bench.rod.compiling import njit
 from softgm_bench.rod.scalar_contact import product
 
 SLACK = 1e-4  # m, by which the bounds are widened; float32 rounds positions of a few metres to less than 1e-6
@@ -21,11 +22,11 @@ def senses(x, y, z, centre_x, centre_y, centre_z, radius, sensing_radius):
     return math.sqrt(product(x, x) + product(z, z) + product(y, y)) - radius < sensing_radius
 
 
-_jit = numba.njit(cache=True, error_model="numpy")
+_jit = njit(error_model="numpy")
 _senses = _jit(with_callees(senses, {"product": _jit(product)}))
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@njit(parallel=True, error_model="numpy")
 def look(
     agents,
     start,
@@ -87,7 +88,7 @@ def look(
                 edge[b, i, s] = sensed[i, k]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _within_reach(point, start, axis, length, reach, bin_length):
     """Range of a cylinder's bins whose centres may lie within ``reach`` of a point; empty for most cylinders."""
     x, y, z = point[0] - start[0], point[1] - start[1], point[2] - start[2]
@@ -104,14 +105,14 @@ def _within_reach(point, start, axis, length, reach, bin_length):
     return low, int((along + half) / bin_length) + 2
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _sensed(point, descriptor, sensing_radius):
     return _senses(
         point[0], point[1], point[2], descriptor[0], descriptor[1], descriptor[2], descriptor[6], sensing_radius
     )
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _any(sensed, k):
     found = False
     for i in range(sensed.shape[0]):

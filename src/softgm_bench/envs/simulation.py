@@ -5,6 +5,7 @@
 waits for the device: see ``softgm_bench.rod.sync``.
 """
 
+import copy
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import NamedTuple
@@ -150,6 +151,17 @@ class Simulator:
             episodes=fresh.clone(), progress=progress, push=nothing, tip_force=nothing.clone(), batch_size=[num_envs]
         )
 
+    def __deepcopy__(self, memo: dict[int, object]) -> "Simulator":
+        """A simulator that moves on its own; what never changes is shared.
+
+        Without this a copy would move the same arms: a tensorclass gives itself in place of a copy.
+        """
+        other = copy.copy(self)
+        other.state = self.state.clone()
+        other._generator = copy.deepcopy(self._generator, memo)
+        other.perturbation = copy.deepcopy(self.perturbation, memo)
+        return other
+
     # generators
 
     def seed(self, seed: int) -> None:
@@ -249,9 +261,11 @@ class Simulator:
         blank = Beginning(
             rod=straight_rods(self.backend.parameters, count, self.dtype, self.device),
             table=empty_table(count, self.n_slots, self._n_bins, self.device),
-            previous_action=torch.zeros((count, self.task.config.n_agents, DIRECTIONS), device=self.device),
+            previous_action=torch.zeros(
+                (count, self.task.config.n_agents, DIRECTIONS), dtype=torch.float32, device=self.device
+            ),
             never=torch.zeros(count, dtype=torch.bool, device=self.device),
-            whole=torch.ones(count, device=self.device),
+            whole=torch.ones(count, dtype=torch.float32, device=self.device),
         )
         if not sync.is_free(self.device):
             self._beginnings[count] = blank

@@ -66,8 +66,9 @@ class SoftArmEnv(RememberingEnv):
             horizon: control steps until truncation, the task's by default.
             device: of the simulation and of all entries.
             dtype: of the rod's state; entries that policies read are float32.
-            stagger: a full reset starts the episodes' clocks at random steps, so that their truncations do not fall
-                together and every batch of training holds all phases of an episode.
+            stagger: for training; a full reset starts the episodes' clocks at random steps, so that their truncations
+                do not fall together and every batch of training holds all phases of an episode. The first scenes are
+                then not those of ``set_seed``: some were drawn while building, as in all trainings of before.
             perturbation: of observations, sections and tip, none by default.
 
         Raises:
@@ -79,6 +80,8 @@ class SoftArmEnv(RememberingEnv):
         self.task = task
         self._stagger = stagger
         self.simulator = Simulator(task, backend, num_envs, seed, self.horizon, self.device, dtype, perturbation)
+        if not stagger:
+            self.simulator.seed(seed)  # a seed means the same scenes here as in ``set_seed``
         curriculum, perturbed = self.simulator.curriculum, self.simulator.perturbation is not None
         specs = make_specs(num_envs, self.sizes, self.device, curriculum=curriculum, perturbed=perturbed)
         for name, spec in specs.items():
@@ -121,7 +124,8 @@ class SoftArmEnv(RememberingEnv):
         if seed is not None:
             self.simulator.seed(seed)
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDict:
+    def _reset(self, tensordict: TensorDictBase | None = None, seed: int | None = None, **kwargs) -> TensorDict:
+        self._set_seed(seed)
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None:
             self.simulator.begin(self._stagger)

@@ -113,7 +113,8 @@ class VmasEnv(RememberingEnv):
                 self._generator = torch.get_rng_state()
             self._taken = self.batch_size[0]
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDict:
+    def _reset(self, tensordict: TensorDictBase | None = None, seed: int | None = None, **kwargs) -> TensorDict:
+        self._set_seed(seed)
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is not None:
             self._begin_again(mask.reshape(-1))

@@ -14,6 +14,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from softgm_bench.envs import entries
 from softgm_bench.envs.entries import Column
+from softgm_bench.errors import NotFinite
 from softgm_bench.rod import sync
 
 DISCOUNT = 0.99  # of the returns that are reported, whatever an algorithm trains with
@@ -84,6 +85,9 @@ def evaluate(
 
     Training is not disturbed: ``env`` must not be the training environment, and the global generator, on which a
     policy that samples draws, is put back.
+
+    Raises:
+        NotFinite: the policy has chosen an action that is not finite.
     """
     exploration = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
     devices = [env.device] if env.device is not None and env.device.type == "cuda" else []
@@ -150,6 +154,7 @@ def _first_episodes(
 ) -> EpisodeRecords:
     data = env.reset()
     alive = torch.ones(env.batch_size, dtype=torch.bool, device=env.device)
+    sound = torch.ones((), dtype=torch.bool, device=env.device)
     tally: _Tally | None = None
     free = sync.is_free(alive.device)
     told, ended = 0, 0
@@ -161,12 +166,16 @@ def _first_episodes(
                 told, ended = step, alive.numel() - going
             if not going:
                 break
-        data = env.step(act(policy, data if show is None else show(data), alive))
+        chosen = act(policy, data if show is None else show(data), alive)
+        sound = sound & chosen[entries.ACTION].isfinite().all()
+        data = env.step(chosen)
         after = data["next"]
         tally = tally or _Tally(after, gamma)
         tally.add(after, alive)
         alive = alive & ~after[entries.DONE].squeeze(-1)
         data = step_mdp(data)
+    if not sound:
+        raise NotFinite("an action of the policy is not finite")
     assert tally is not None
     return tally.records(getattr(env, "horizon", None))
 

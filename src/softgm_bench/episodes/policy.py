@@ -16,6 +16,7 @@ from softgm_bench.config.checks import device_type
 from softgm_bench.config.explain import USER_ERRORS
 from softgm_bench.envs import Sizes, kind_of
 from softgm_bench.errors import UserError
+from softgm_bench.models.finite import not_finite
 from softgm_bench.rod.backend import runs_on
 from softgm_bench.storage import archive
 from softgm_bench.storage.files import write_where_asked
@@ -62,8 +63,8 @@ def load(path: Path, device: str = "cpu", overrides: Sequence[str] = ()) -> Trai
             networks must take what is observed there: SoftGM's take any N and M, an MLP's any N.
 
     Raises:
-        UserError: there is none, it is damaged, this version cannot build its networks, they do not fit the settings,
-            or the settings make no sense.
+        UserError: there is none, it is damaged or not finite, this version cannot build its networks, they do not fit
+            the settings, or the settings make no sense.
         HydraException, OmegaConfBaseException: a setting cannot be read, is misspelt or of a wrong type.
     """
     validate_device(device)
@@ -79,6 +80,8 @@ def load(path: Path, device: str = "cpu", overrides: Sequence[str] = ()) -> Trai
         raise UserError(
             f"{file}: this version cannot build its networks; use the version that trained it, with the same plugins"
         ) from error
+    if (found := not_finite(policy.named_parameters())) is not None:
+        raise UserError(f"{file}: {found}, its training has diverged; use an earlier checkpoint")
     if overrides:
         result.config = changed(plain(result.config), overrides)
         result.policy = _fitted(file, result)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
 from softgm_bench.errors import UserError
@@ -11,6 +12,27 @@ from softgm_bench.errors import UserError
 if TYPE_CHECKING:  # a refused command need not wait for torch
     from softgm_bench.episodes.evaluation import EpisodeRecords, Watch
     from softgm_bench.episodes.policy import TrainedPolicy
+
+
+def whole_from_one(name: str, value: Any, *, optional: bool = False) -> None:
+    """Refuse what is no whole number from 1 on, or with ``optional`` None.
+
+    Raises:
+        UserError: with the name and the value.
+    """
+    if (value is None and optional) or (isinstance(value, Integral) and int(value) >= 1):
+        return
+    raise UserError(f"{name}={value}: it must be at least 1, a whole number")
+
+
+def check_seed(seed: Any) -> None:
+    """Refuse what is no seed.
+
+    Raises:
+        UserError: saying what one is.
+    """
+    if not (isinstance(seed, Integral) and 0 <= int(seed) < 2**63):
+        raise UserError(f"seed={seed}: a seed is a whole number from 0 to 2**63 - 1")
 
 
 @dataclass
@@ -43,11 +65,8 @@ class Protocol:
             UserError: naming the first such setting, its value and what would be right.
         """
         for key in ("episodes", "horizon", "batch"):
-            value = getattr(self, key)
-            if value is not None and value < 1:
-                raise UserError(f"{key}={value}: it must be at least 1")
-        if not 0 <= self.seed < 2**63:
-            raise UserError(f"seed={self.seed}: a seed is a whole number from 0 to 2**63 - 1")
+            whole_from_one(key, getattr(self, key), optional=key != "episodes")
+        check_seed(self.seed)
         if not 0.0 <= self.gamma <= 1.0:
             raise UserError(f"gamma={self.gamma}: it must lie between 0 and 1")
         if self.intervention != "none":

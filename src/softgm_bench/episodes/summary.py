@@ -33,7 +33,8 @@ def summarise(records: EpisodeRecords) -> dict[str, Any]:
         else:
             numbers[RENAMED.get(name, name)] = {"mean": float(np.mean(values)), "std": float(np.std(values))}
     if "success" in records and "final_tip_step" in records:
-        metrics["motionless_failures"] = int((~records["success"] & (records["final_tip_step"] < MOTIONLESS)).sum())
+        failed = np.logical_not(records["success"])
+        metrics["motionless_failures"] = int((failed & (records["final_tip_step"] < MOTIONLESS)).sum())
     if "success" in records and (by_step := success_by_step(records, records.horizon)):
         metrics["success_by_step"] = by_step
     return metrics | numbers

@@ -13,15 +13,13 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from softgm_bench import compilation
-
-compilation.watch()
+from softgm_bench.rod.compiling import njit
 
 NEIGHBOURS = 3  # the previous agent, the agent itself, the next one
 FAST = {"reassoc", "contract", "nsz"}  # sums may be reordered: LLVM vectorises them then
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy", fastmath=FAST)
+@njit(parallel=True, error_model="numpy", fastmath=FAST)
 def aggregate(values, weights, n_agents, out):
     """Write the weighted sums of messages, ``out`` ``(T, H C)``.
 
@@ -43,7 +41,7 @@ def aggregate(values, weights, n_agents, out):
                     _add(weights[2, row, head], values[row + 1, start:stop], new)
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy", fastmath=FAST)
+@njit(parallel=True, error_model="numpy", fastmath=FAST)
 def differentiate(values, weights, gradient, n_agents, of_values, of_weights):
     """Write the gradients of ``aggregate``'s messages and weights from that of its ``out``.
 

@@ -98,9 +98,15 @@ def main(arguments: list[str]) -> None:
 
 
 def _check(options: Options, files: list[Path]) -> None:
-    wrong = [f"{file}: its name must end in one of" for file in files if file.suffix not in KINDS]
+    wrong = [file for file in files if file.suffix not in KINDS]
+    if len(files) > 1 and wrong:
+        raise UserError(
+            f"out={options.out}: commas stand between files, and {wrong[0]} ends in none of {', '.join(KINDS)}; "
+            "a file's own name cannot hold one"
+        )
     if wrong or not files:
-        raise UserError(f"{wrong[0] if wrong else 'out: name a file that ends in'} {', '.join(KINDS)}")
+        what = f"{wrong[0]}: its name must end in one of" if wrong else "out: name a file that ends in"
+        raise UserError(f"{what} {', '.join(KINDS)}")
     kinds = {file.suffix for file in files}
     for name, (low, high) in RANGES.items():
         value = getattr(options, name)

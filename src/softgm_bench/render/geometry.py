@@ -4,11 +4,7 @@ from collections.abc import Callable
 from math import sqrt
 from typing import Any
 
-import numba
-
-from softgm_bench import compilation
-
-compilation.watch()
+from softgm_bench.rod.compiling import njit
 
 MISS = 1e30
 # Nothing here computes with infinities or NaN on purpose, but a ray along an axis divides by zero and is caught after.
@@ -20,7 +16,7 @@ def jit(function: Callable[..., Any]) -> Callable[..., Any]:
 
     Calls are put in line: an array is seven words and more to hand over.
     """
-    return numba.njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True, forceinline=True)(function)
+    return njit(fastmath=FASTMATH, error_model="numpy", nogil=True, forceinline=True)(function)
 
 
 @jit

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from softgm_bench.rod import sync
 from softgm_bench.rod.callees import with_callees
+from softgm_bench.rod.compiling import njit
 from softgm_bench.rod.contact import element_radius, safe_norm
 from softgm_bench.rod.scalar_contact import clip, product
 from softgm_bench.rod.scalar_nodes import radius_of, touches
@@ -73,13 +74,13 @@ def point_segment_distance(point: Tensor, start: Tensor, axis: Tensor, length: T
     return safe_norm(offset - along[..., None] * axis, dim=-1)
 
 
-_jit = numba.njit(cache=True, error_model="numpy")
+_jit = njit(error_model="numpy")
 _product = _jit(product)
 _radius_of = _jit(with_callees(radius_of, {"product": _product}))
 _touches = _jit(with_callees(touches, {"product": _product, "clip": _jit(clip)}))
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@njit(parallel=True, error_model="numpy")
 def _mark(position, volume, start, axis, length, radius, mask, touching):
     """Set ``touching``; a cylinder whose bounding box is apart from the rod's costs a few comparisons."""
     for b in numba.prange(position.shape[0]):
@@ -99,7 +100,7 @@ def _mark(position, volume, start, axis, length, radius, mask, touching):
                 _compare(position[b], node_radius, start[b, c], axis[b, c], length[b, c], radius[b, c], touching[b])
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _box(x, volume):
     """Bounds of the rod's nodes ``(3, n_nodes)``, widened by more than the largest node's radius."""
     thickest = volume[0] - volume[0]
@@ -116,7 +117,7 @@ def _box(x, volume):
     return low, high
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _node_radius(x, volume):
     """Mean radius of each node's elements, in the order of ``contact_nodes_dense``'s arithmetic."""
     n, real = volume.shape[0], x.dtype.type
@@ -129,7 +130,7 @@ def _node_radius(x, volume):
     return out
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _compare(x, node_radius, start, axis, length, radius, touching):
     """Mark the nodes that touch one cylinder."""
     for k in range(x.shape[1]):

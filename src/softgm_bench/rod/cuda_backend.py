@@ -7,7 +7,7 @@ from softgm_bench.rod.cuda_kernel import SIMULATED, Coefficients, coefficients
 from softgm_bench.rod.cuda_launch import REAL, launch
 from softgm_bench.rod.cuda_step import MAX_ELEMENTS, ROWS, make_step, scratch_columns
 from softgm_bench.rod.parameters import RodParameters
-from softgm_bench.rod.state import Cylinders, RodState, check_inputs
+from softgm_bench.rod.state import Cylinders, RodState, check_inputs, refuse_gradients
 
 
 class CudaBackend:
@@ -52,9 +52,11 @@ class CudaBackend:
             A new state.
 
         Raises:
-            ValueError: if the arguments' shapes do not fit together, or a tensor is not where the state is.
+            ValueError: if the arguments' shapes do not fit together, a tensor is not where the state is, or a gradient
+                is asked for.
         """
         check_inputs(self.parameters, state, couple, force, cylinders, active)
+        refuse_gradients("cuda", couple, force, state.position, state.director, state.velocity, state.omega)
         device, dtype = state.position.device, state.position.dtype
         _check_device(device, couple=couple, force=force, active=active, cylinders=cylinders)
         if dtype not in REAL:

@@ -5,6 +5,7 @@ import torch
 from torch import Tensor
 
 from softgm_bench.rod import sync
+from softgm_bench.rod.compiling import njit
 from softgm_bench.rod.state import RodState, dilatation
 
 
@@ -42,7 +43,7 @@ def diverged_dense(state: RodState, rest_length: Tensor, low: float, high: float
     return ~good
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@njit(parallel=True, error_model="numpy")
 def _find(position, director, velocity, omega, rest_length, out, low, high):
     for b in numba.prange(position.shape[0]):
         x = position[b]
@@ -58,7 +59,7 @@ def _find(position, director, velocity, omega, rest_length, out, low, high):
         out[b] = not good
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _finite(values):
     nothing = values[0] - values[0]
     for k in range(values.shape[0]):

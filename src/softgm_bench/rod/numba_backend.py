@@ -13,12 +13,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from softgm_bench.rod import forks
 from softgm_bench.rod.numba_contact import COLUMNS, NEXT_CHECK, make_contact, make_touch
 from softgm_bench.rod.numba_kernel import jit, larger, make_kernel, make_straighten
 from softgm_bench.rod.numba_layout import CACHE_LINE, Layout, constant_rows, make_layout
 from softgm_bench.rod.parameters import CONTACT_MODELS, RodParameters, rod_constants
 from softgm_bench.rod.scalar_contact import EDGE, RADIUS, START
-from softgm_bench.rod.state import Cylinders, RodState, check_inputs
+from softgm_bench.rod.state import Cylinders, RodState, check_inputs, refuse_gradients
 
 
 class NumbaBackend:
@@ -26,6 +27,7 @@ class NumbaBackend:
 
     def __init__(self, parameters: RodParameters) -> None:
         """Prepare for one arm; compilation happens at the first step of each precision and is cached on disk."""
+        forks.check()
         self.parameters = parameters
         self._constants = rod_constants(parameters)
         gravity = np.asarray(parameters.gravity)[:, None] * self._constants.mass
@@ -55,9 +57,11 @@ class NumbaBackend:
             A new state.
 
         Raises:
-            ValueError: if the arguments' shapes do not fit together.
+            ValueError: if the arguments' shapes do not fit together, or a gradient is asked for.
         """
         check_inputs(self.parameters, state, couple, force, cylinders, active)
+        forks.check()
+        refuse_gradients("numba", couple, force, state.position, state.director, state.velocity, state.omega)
         dtype = state.position.dtype
         num_envs, n = couple.shape[0], self.parameters.n_elements
         rows, scalars, contact = self._table(dtype)
@@ -80,6 +84,7 @@ class NumbaBackend:
             contact,
             self.parameters.substeps if substeps is None else substeps,
         )
+        forks.note_threads()
         return new
 
     def _table(self, dtype: torch.dtype) -> tuple[NDArray, NDArray, NDArray]:

@@ -12,17 +12,14 @@ from functools import lru_cache
 from math import acos, cos, exp, sin, sqrt
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 from llvmlite import ir
 from numba.extending import intrinsic
 
-from softgm_bench import compilation
 from softgm_bench.rod.callees import with_callees
+from softgm_bench.rod.compiling import njit
 from softgm_bench.rod.numba_layout import Layout, make_layout
 from softgm_bench.rod.series import SMALL_BEND, SMALL_EXPONENT, SMALL_TURN, TINY, bend, cosc, exponential, sinc
-
-compilation.watch()
 
 # No NaN test happens inside the kernel, so "nnan" is safe; infinities keep their IEEE meaning.
 FASTMATH = {"contract", "reassoc", "nsz", "nnan", "arcp"}
@@ -38,10 +35,9 @@ def jit(
     ``callees`` are bound as ``callees`` says; ``Layout.source`` in the closure stands for their content. A function
     with ``inline`` becomes part of each caller before LLVM sees it, as if it had been written there.
     """
-    compiler = numba.njit(
+    compiler = njit(
         fastmath=FASTMATH,
         error_model="numpy",
-        cache=True,
         parallel=parallel,
         inline="always" if inline else "never",
     )

@@ -1,6 +1,6 @@
 """This module holds the arm's physical parameters and derives the constants of the discretised rod from them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import numpy as np
@@ -57,6 +57,10 @@ class RodParameters:
         Raises:
             ValueError: with one line naming the field, its value and what would be right.
         """
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if not isinstance(value, str) and not np.isfinite(value).all():
+                raise ValueError(f"rod.{item.name} is {value}: it must be finite")
         if self.n_elements < 2:
             raise ValueError(f"rod.n_elements is {self.n_elements}: a rod needs at least 2 elements")
         if self.substeps < 1:

@@ -79,6 +79,19 @@ def dilatation(position: Tensor, rest_length: Tensor) -> Tensor:
     return edges.norm(dim=-2) / rest_length
 
 
+def refuse_gradients(backend: str, *tensors: Tensor | None) -> None:
+    """Refuse tensors whose gradient would be asked for, in a kernel that has none.
+
+    Raises:
+        ValueError: naming what would do.
+    """
+    if torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in tensors):
+        raise ValueError(
+            f"the action, force or state requires a gradient, and backend={backend} has none: "
+            "choose backend=torch, or step under torch.no_grad()"
+        )
+
+
 def check_inputs(
     parameters: RodParameters,
     state: RodState,

@@ -1,6 +1,8 @@
 """The folder of a run: where its files lie, when a run may begin in it, how a file is written whole."""
 
 import os
+import socket
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -9,7 +11,7 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from softgm_bench.errors import UserError
-from softgm_bench.storage.files import wait_for_disk, write_atomically
+from softgm_bench.storage.files import to_json, wait_for_disk, write_atomically
 from softgm_bench.storage.run_folder import RunFolder
 
 ANEW = "to begin anew, give overwrite=true instead of resume=true"
@@ -51,7 +53,7 @@ def cut_back(folder: RunFolder, config: Mapping[str, Any], iterations: int, eval
     """
     _keep_lines(folder.metrics, 1 + iterations if iterations else 0)
     _keep_lines(folder.evaluations, evaluations)
-    for path in (folder.summary, folder.episodes, *_left_over(folder)):
+    for path in (folder.summary, folder.episodes, folder.failure, *_left_over(folder)):
         path.unlink(missing_ok=True)
     write_atomically(folder.config, _yaml(config))
 
@@ -74,6 +76,16 @@ def exclusive(run_dir: str) -> Iterator[None]:
         yield
     finally:
         os.close(descriptor)
+
+
+def write_failure(folder: RunFolder, line: str) -> None:
+    """Leave the reason of a failure, unless the folder holds a finished run or cannot be written."""
+    if folder.summary.exists():
+        return
+    record = {"error": line, "host": socket.gethostname(), "time": time.time()}
+    with suppress(OSError):
+        folder.path.mkdir(parents=True, exist_ok=True)
+        write_atomically(folder.failure, to_json(record).encode())
 
 
 def to_disk(folder: RunFolder) -> None:
@@ -128,7 +140,7 @@ def _remove_run(folder: RunFolder) -> None:
 
 
 def _files(folder: RunFolder) -> list[Path]:
-    files = [folder.summary, folder.config, folder.metrics, folder.evaluations, folder.episodes]
+    files = [folder.summary, folder.config, folder.metrics, folder.evaluations, folder.episodes, folder.failure]
     return files + list(folder.checkpoints.glob("frames-*.pt")) + _left_over(folder)
 
 

@@ -1,11 +1,23 @@
-"""Ctrl-C and SIGTERM end a run where its state is whole: it can be resumed from the checkpoint written then."""
+"""Ctrl-C, SIGTERM and the like end a run where its state is whole: it can be resumed from the checkpoint written then.
+
+A terminal that is closed sends SIGHUP, a queue warns with SIGUSR1 or SIGUSR2. What the parent process has set to be
+ignored stays ignored, as under ``nohup``.
+"""
 
 import os
 import signal
-from collections.abc import Iterator
-from contextlib import contextmanager
+import sys
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import Any, Self
+
+STOPPING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGUSR1", "SIGUSR2") if hasattr(signal, name))
+
+
+def heeded(numbers: Iterable[int]) -> list[int]:
+    """Give those of the signals that this process does not ignore."""
+    return [number for number in numbers if signal.getsignal(number) != signal.SIG_IGN]
 
 
 class Interrupted(KeyboardInterrupt):
@@ -18,7 +30,7 @@ class Interrupted(KeyboardInterrupt):
 
 
 class Interruption:
-    """While entered, the first SIGINT or SIGTERM waits for ``check`` or ``at_once``; a second stops anywhere."""
+    """While entered, a first SIGINT or ``STOPPING`` waits for ``check`` or ``at_once``; a second stops anywhere."""
 
     def __init__(self) -> None:
         """Nothing has arrived yet."""
@@ -28,7 +40,7 @@ class Interruption:
 
     def __enter__(self) -> Self:
         """Begin to listen."""
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in heeded((signal.SIGINT, *STOPPING)):
             self._previous[number] = signal.signal(number, self._receive)
         return self
 
@@ -58,4 +70,7 @@ class Interruption:
         if self._received is not None:
             raise KeyboardInterrupt("stopped at once; only earlier checkpoints are left")
         self._received = number
-        os.write(2, b"\nstopping after this iteration; once more to stop at once\n")  # print may be under way itself
+        with suppress(OSError, ValueError, AttributeError):  # nobody may be left to read it
+            os.write(
+                sys.stderr.fileno(), b"\nstopping after this iteration; once more to stop at once\n"
+            )  # print may be under way itself

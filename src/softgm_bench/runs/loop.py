@@ -10,16 +10,17 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
+from softgm_bench import output
 from softgm_bench.algorithms import Algorithm
 from softgm_bench.assembly import build_algorithm, build_env
 from softgm_bench.config import Config, plain
 from softgm_bench.episodes.evaluation import EpisodeRecords
 from softgm_bench.episodes.summary import summarise, table
-from softgm_bench.errors import UserError
-from softgm_bench.runs import checkpoint, ending, folder, resume
+from softgm_bench.errors import NotFinite, UserError
+from softgm_bench.runs import checkpoint, divergence, ending, folder, resume
 from softgm_bench.runs.budget import Budget
 from softgm_bench.runs.interruption import Interrupted, Interruption
-from softgm_bench.runs.loggers.guarded import Loggers
+from softgm_bench.runs.loggers.guarded import Loggers, refuse_missing
 from softgm_bench.runs.loggers.video import episode_video
 from softgm_bench.runs.machine import keep_memory, set_matmul, set_threads
 from softgm_bench.runs.metrics import CsvWriter, EpisodeTracker, step_metrics
@@ -27,6 +28,7 @@ from softgm_bench.runs.progress import Progress
 from softgm_bench.runs.run import Run, derive_seeds, frames_per_iteration, total_frames
 from softgm_bench.storage.files import to_json
 from softgm_bench.storage.run_folder import RunFolder
+from softgm_bench.upstream import default_dtype
 from softgm_bench.upstream.collector import FrameCollector, RecordingCollector
 
 
@@ -38,10 +40,17 @@ def train(config: Config) -> dict[str, Any]:
 
     Raises:
         UserError: the run folder cannot be used, or not any longer, or holds a run with other settings.
-        Interrupted: SIGINT or SIGTERM; a checkpoint of the last whole iteration is left.
+        NotFinite: training has diverged; the last finite checkpoint is left, and why it failed, but no summary.
+        Interrupted: SIGINT or one of ``interruption.STOPPING``; a checkpoint of the last whole iteration is left.
     """
+    with output.unbreakable(), default_dtype.float32():
+        return _train(config)
+
+
+def _train(config: Config) -> dict[str, Any]:
     if config.resume and (summary := resume.finished(config, total_frames(config))) is not None:
         return summary
+    refuse_missing(config)
     run = _build(config)
     try:
         with folder.exclusive(config.run_dir):
@@ -70,9 +79,20 @@ def _go(run: Run) -> EpisodeRecords:
                 seed = run.seeds.final_evaluation
                 watch = progress.evaluation(settings.final_episodes)
                 return ending.play(run, settings.final_episodes, seed, settings.final_horizon, watch)
+        except NotFinite as error:
+            raise _told(run, error) from error
         except Interrupted as stop:
             stop.args = (f"interrupted after {run.frames} frames, resume=true resumes it; checkpoint: {_save(run)}",)
             raise
+
+
+def _told(run: Run, error: NotFinite) -> NotFinite:
+    """Complete the message, and leave it in the run's folder."""
+    kept = run.folder.newest()
+    last = f"the last finite checkpoint is {kept}" if kept else "there was no checkpoint yet"
+    line = f"{error} after {run.frames} frames: training has diverged, {last}; try smaller learning rates"
+    folder.write_failure(run.folder, line)
+    return NotFinite(line)
 
 
 def _build(config: Config) -> Run:
@@ -126,6 +146,7 @@ def _learn(run: Run, interruption: Interruption, progress: Progress) -> None:
             row = _row(run, batch, losses, time.perf_counter() - began)
             metrics.write(row)
             run.loggers.metrics(row)
+            divergence.check_update(run.algorithm, batch, losses)
             progress.advance(batch.numel(), row.get("success_rate", math.nan))
             interruption.check()
             run.budget.lap()

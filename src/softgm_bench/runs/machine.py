@@ -45,5 +45,5 @@ def keep_memory() -> None:
 
 def _products_are_float32() -> bool:
     """Tell whether a product keeps a digit that bfloat16 has no room for."""
-    values = torch.full((64, 64), 1.0 + 2.0**-12)
-    return torch.equal(values @ torch.eye(64), values)
+    values = torch.full((64, 64), 1.0 + 2.0**-12, dtype=torch.float32)
+    return torch.equal(values @ torch.eye(64, dtype=torch.float32), values)

@@ -16,6 +16,7 @@ from softgm_bench.config import Config, plain, typed
 from softgm_bench.config.comparison import ABSENT, differences
 from softgm_bench.config.explain import USER_ERRORS
 from softgm_bench.errors import UserError
+from softgm_bench.models.finite import not_finite
 from softgm_bench.runs import checkpoint
 from softgm_bench.runs import folder as run_folder
 from softgm_bench.runs.folder import ANEW
@@ -53,10 +54,10 @@ def finished(config: Config, frames: int) -> dict[str, Any] | None:
 def newest_state(config: Config) -> dict[str, Any] | None:
     """The newest whole checkpoint of the run in ``run_dir``; None, and a line that says so, if it has none yet.
 
-    A damaged one is passed over with a line.
+    One that is damaged or not finite is passed over with a line.
 
     Raises:
-        UserError: the run has other settings or cannot be read, or all of its checkpoints are damaged.
+        UserError: the run has other settings or cannot be read, or none of its checkpoints can be used.
     """
     folder = RunFolder(Path(config.run_dir))
     paths = folder.in_order()
@@ -68,10 +69,13 @@ def newest_state(config: Config) -> dict[str, Any] | None:
         except UserError as error:
             _say(f"passed over {error}")
             continue
+        if (found := not_finite(state.get("policy", {}).items())) is not None:
+            _say(f"passed over {path}: {found}, training had diverged")
+            continue
         _say(f"{folder.path}: resuming after {state['frames']} frames")
         return state
     if paths:
-        raise UserError(f"{folder.checkpoints}: no checkpoint here is whole; {ANEW}")
+        raise UserError(f"{folder.checkpoints}: no checkpoint here can be used; {ANEW}")
     _say(f"{folder.path}: no checkpoint to resume from, the run begins anew")
     return None
 

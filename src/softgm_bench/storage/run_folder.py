@@ -36,6 +36,11 @@ class RunFolder:
         return self.path / "summary.json"
 
     @property
+    def failure(self) -> Path:
+        """Why the last attempt came to nothing; gone when another begins."""
+        return self.path / "failure.json"
+
+    @property
     def checkpoints(self) -> Path:
         """Folder of the newest checkpoints."""
         return self.path / "checkpoints"

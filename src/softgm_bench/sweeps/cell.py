@@ -24,7 +24,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from softgm_bench import process
+from softgm_bench import output, process
 from softgm_bench.config import typed
 from softgm_bench.config.comparison import ABSENT, differences
 from softgm_bench.config.explain import USER_ERRORS, explain
@@ -197,8 +197,10 @@ def main() -> int:
     job = json.loads(sys.stdin.read())
     _stop_with(job["parent"])
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "w")
-    answer = _train(job["config"], job["overrides"], job["device"])
-    print(json.dumps(answer), file=answers, flush=True)
+    with output.unbreakable():
+        answer = _train(job["config"], job["overrides"], job["device"])
+    with suppress(OSError):  # nobody may be left to listen
+        print(json.dumps(answer), file=answers, flush=True)
     return 0
 
 

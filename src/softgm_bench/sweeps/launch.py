@@ -16,6 +16,7 @@ from typing import Any
 from uuid import uuid4
 
 from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.core.plugins import Plugins
@@ -234,7 +235,9 @@ def _compose(overrides: Sequence[str], directory: str | None = None) -> DictConf
 
 def _parse(overrides: Sequence[str]) -> list[Override]:
     Plugins.instance()  # the parser asks for it
-    return OverridesParser.create().parse_overrides(list(overrides))
+    with initialize_config_dir(version_base="1.3", config_dir=str(config_directory())):
+        loader = GlobalHydra.instance().config_loader()  # knows what glob(...) finds
+        return OverridesParser.create(loader).parse_overrides(list(overrides))
 
 
 def _first_values(overrides: Sequence[str]) -> list[str]:
@@ -260,7 +263,10 @@ def _values(override: Override) -> list[str]:
         return [f"{key}={override.get_value_element_as_str()}"]
     if not override.is_discrete_sweep():
         raise UserError(f"{override.input_line}: not a list of values")
-    return [f"{key}={value}" for value in override.sweep_string_iterator()]
+    values = [f"{key}={value}" for value in override.sweep_string_iterator()]
+    if not values:
+        raise UserError(f"{override.input_line}: nothing in conf/{key} fits it")
+    return values
 
 
 def _quoted(text: str) -> str:

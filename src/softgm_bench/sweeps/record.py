@@ -19,6 +19,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
+from softgm_bench.runs import folder as run_folder
 from softgm_bench.storage.files import to_json, write_atomically
 from softgm_bench.storage.run_folder import RunFolder
 
@@ -44,7 +45,7 @@ def running(run_dir: Path, device: str) -> Iterator[None]:
     run_dir.mkdir(parents=True, exist_ok=True)
     record = {"pid": os.getpid(), "host": socket.gethostname(), "device": device, "started": time.time()}
     write_atomically(_running(run_dir), to_json(record).encode())
-    _failure(run_dir).unlink(missing_ok=True)
+    RunFolder(run_dir).failure.unlink(missing_ok=True)
     try:
         yield
     finally:
@@ -55,17 +56,15 @@ def write_failure(run_dir: Path, line: str) -> None:
     """Leave the reason of a failure, unless a finished run or one at work has the folder, or it cannot be written."""
     if RunFolder(run_dir).summary.exists() or _locked(run_dir):
         return
-    record = {"error": line, "host": socket.gethostname(), "time": time.time()}
+    run_folder.write_failure(RunFolder(run_dir), line)
     with suppress(OSError):
-        run_dir.mkdir(parents=True, exist_ok=True)
-        write_atomically(_failure(run_dir), to_json(record).encode())
         _running(run_dir).unlink(missing_ok=True)
 
 
 def forget_failure(run_dir: Path) -> None:
     """Remove what an earlier attempt left."""
     with suppress(OSError):
-        _failure(run_dir).unlink(missing_ok=True)
+        RunFolder(run_dir).failure.unlink(missing_ok=True)
         _running(run_dir).unlink(missing_ok=True)
 
 
@@ -76,11 +75,14 @@ def state(run_dir: Path) -> State:
         return State(RUNNING, ", ".join(filter(None, [_process(run_dir), _progress(folder)])))
     if folder.summary.exists():
         try:
-            return State(DONE, achieved(json.loads(folder.summary.read_text())))
+            summary = json.loads(folder.summary.read_text())
+            if summary["final_evaluation"]["undiscounted_return"]["mean"] is None:  # JSON's word for NaN
+                return State(FAILED, "its returns are no numbers: the policy had diverged")
+            return State(DONE, achieved(summary))
         except (ValueError, KeyError, TypeError, OSError):
             return State(FAILED, "summary.json is damaged")
-    if _failure(run_dir).exists():
-        return State(FAILED, str(_read(_failure(run_dir)).get("error", "failure.json is damaged")))
+    if folder.failure.exists():
+        return State(FAILED, str(_read(folder.failure).get("error", "failure.json is damaged")))
     if folder.config.exists() or _running(run_dir).exists():
         return State(STOPPED, _progress(folder) or "before the first iteration ended")
     return State(MISSING)
@@ -96,10 +98,6 @@ def achieved(summary: Mapping[str, Any]) -> str:
 
 def _running(run_dir: Path) -> Path:
     return run_dir / "running.json"
-
-
-def _failure(run_dir: Path) -> Path:
-    return run_dir / "failure.json"
 
 
 def _read(path: Path) -> Mapping[str, Any]:

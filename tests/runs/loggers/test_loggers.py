@@ -129,15 +129,25 @@ class TestWandb:
         assert frames[0].shape == (360, 480, 3)
         assert frames[0].std() > 5.0
 
-    def test_a_resumed_run_is_the_same_run(self, tmp_path, file):
+    def test_parts_of_a_resumed_run_lie_side_by_side_and_none_is_uploaded_over_another(self, tmp_path, file):
+        import wandb_file
+
         config = compose(["logger=wandb"])
-        for frames in (0, 16):
+        for frames in (0, 16, 32):
             with Loggers(config, tmp_path, frames) as loggers:
                 loggers.metrics({"frames": frames + 16, "loss": 1.0})
+                loggers.evaluation(frames + 16, {"length": 2.0})
                 assert list(loggers.active) == ["wandb"]
 
-        ids = {path.stem for path in tmp_path.glob("wandb/offline-run-*/run-*.wandb")}
-        assert ids == {f"run-{(tmp_path / 'wandb/run_id').read_text()}"}
+        paths = sorted(tmp_path.glob("wandb/offline-run-*/run-*.wandb"), key=lambda path: len(path.stem))
+        first = (tmp_path / "wandb/run_id").read_text()
+        assert {path.stem for path in paths} == {f"run-{first}", f"run-{first}-16", f"run-{first}-32"}
+        deadline = time.monotonic() + 60  # W&B writes in a process of its own
+        while len(rows := [row for path in paths for row in wandb_file.history(path)]) < 3:
+            assert time.monotonic() < deadline
+            time.sleep(0.2)
+        assert sorted(row["_step"] for row in rows) == sorted(row["frames"] for row in rows)
+        assert {row["_step"] for row in rows} == {16, 32, 48}
 
 
 class TestTensorboard:
@@ -315,3 +325,13 @@ def test_the_order_of_loggers_does_not_matter(chosen):
     assert logger.csv
     assert logger.wandb is not None
     assert logger.tensorboard is None
+
+
+@pytest.mark.parametrize("name", ["wandb", "tensorboard"])
+def test_a_logger_that_was_asked_for_and_is_not_installed_is_refused_before_anything_is_written(
+    tmp_path, monkeypatch, name
+):
+    monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(UserError, match=rf"^logger={name}: {name} is not installed: pip install {name}, or choose"):
+        train(compose([*TINY, f"run_dir={tmp_path / 'run'}", f"logger={name}"]))
+    assert not (tmp_path / "run").exists()

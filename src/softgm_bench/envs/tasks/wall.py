@@ -1,7 +1,7 @@
 """``wall``, ``wall_narrow``, ``wall_fixed``: a wall of columns with one opening (paper, scenario c)."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -43,7 +43,7 @@ class WallConfig(TaskConfig):
     target_x: Range
     target_y: Range
     target_z: Range
-    max_path: float
+    max_path: float = field(metadata={"infinite": True})  # m; an infinity: every pair
     curriculum: WallCurriculumConfig
 
 

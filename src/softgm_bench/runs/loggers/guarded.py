@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -13,10 +14,13 @@ from typing import Any, Self
 from tqdm import tqdm
 
 from softgm_bench.config import Config
+from softgm_bench.errors import UserError
 from softgm_bench.runs.loggers.interface import Logger, Row
 
 # Means over an iteration's finished episodes: NaN says that there was none, and is left out.
 EPISODE_MEANS = ("episode_return", "episode_length", "success_rate")
+
+PACKAGES = {"wandb": "wandb", "tensorboard": "tensorboard"}  # that loggers need, by the logger's name
 
 
 class Loggers:
@@ -81,6 +85,25 @@ class Loggers:
         except Exception as error:  # whatever a library, its server or the disk comes up with
             self.active.pop(name, None)
             warn(f"logger {name} stopped ({_reason(error)}); the run goes on, its folder has everything")
+
+
+def refuse_missing(config: Config) -> None:
+    """Refuse a run whose loggers are not installed, before anything is written.
+
+    Raises:
+        UserError: naming the first of them and how it is installed.
+    """
+    for name, settings in asdict(config.logger).items():
+        if settings is not None and name in PACKAGES and not _is_there(PACKAGES[name]):
+            package = PACKAGES[name]
+            raise UserError(f"logger={name}: {package} is not installed: pip install {package}, or choose logger=csv")
+
+
+def _is_there(package: str) -> bool:
+    try:
+        return find_spec(package) is not None
+    except ValueError:  # it was kept out of ``sys.modules``
+        return False
 
 
 def flattened(metrics: Mapping[str, Any]) -> dict[str, float]:
