@@ -12,7 +12,7 @@ from softgm_bench.config import Config
 process.prepare()  # this process is an entry point too; nothing has multiplied yet
 torch.set_num_threads(1 if "PYTEST_XDIST_WORKER" in os.environ else 2)
 
-TASKS = ("basic", "structured", "wall", "wall_narrow", "wall_fixed")
+TASKS = ("basic", "structured", "wall", "wall_narrow", "wall_fixed", "wall_touch", "wall_search", "wall_decoy")
 
 
 @pytest.fixture(scope="session")
