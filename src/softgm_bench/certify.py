@@ -8,8 +8,10 @@ search goes on from what ``out`` holds. Settings, with their defaults:
   seed=0               of the evaluation whose scenes they are
   policies=[]          policies' files, run folders or checkpoints whose episodes are tried first
   samples=1            how often each of them is tried with sampled actions, beside once without
+  borrow=[]            files of other tasks' certified scenes, of which the most similar ones are tried next,
+  nearest=8            so many for each scene
   minutes=10           for the search after that; it ends sooner if all scenes are certified
-  steps=80             control steps of a sequence at most
+  steps=60             control steps of a sequence at most
   children=8           new sequences a scene and round
   out=null             file; null: the one that evaluations read
   threads=1            null: every core that this process may use
@@ -38,8 +40,10 @@ class Options:
     seed: int = 0
     policies: list[str] = field(default_factory=list)
     samples: int = 1
+    borrow: list[str] = field(default_factory=list)
+    nearest: int = 8
     minutes: float = 10.0
-    steps: int = 80
+    steps: int = 60
     children: int = 8
     out: str | None = None
     threads: int | None = 1
@@ -72,7 +76,8 @@ def _certify(arguments: list[str]) -> None:
     # late: a refused command need not wait for torch
     from softgm_bench.assembly import configure
     from softgm_bench.certification import Bench, Search
-    from softgm_bench.certification.search import run
+    from softgm_bench.certification.bench import to_tensor
+    from softgm_bench.certification.search import described, run
     from softgm_bench.envs import kind_of
     from softgm_bench.episodes import certified
     from softgm_bench.runs.machine import keep_memory, set_threads
@@ -94,6 +99,10 @@ def _certify(arguments: list[str]) -> None:
 
     note()
     _follow(search, config, options, note)
+    for name in options.borrow:
+        other = certified.load(Path(name))
+        search.borrow(other, described(*map(to_tensor, (other.privileged, other.target))).numpy(), options.nearest)
+        note()
     until = time.monotonic() + 60.0 * options.minutes
     run(search, lambda: time.monotonic() >= until, options.children, note)
     print(f"written to {path}")

@@ -12,12 +12,12 @@ from softgm_bench.episodes.summary import summarise
 from softgm_bench.rod.parameters import RodParameters
 
 ROD = RodParameters(substeps=50)
+PRESS = torch.tensor([1.0, 0.4])  # to the wall and along it, so that the tip does not rest between two columns
 
 
 def pressing(env, steps):
     """Frames of arms that bend towards the wall and lean on it."""
-    action = torch.zeros(env.batch_size[0], 6, 2)
-    action[..., 0] = 1.0
+    action = PRESS.expand(env.batch_size[0], 6, 2)
     td, frames = env.reset(), []
     for _ in range(steps):
         td = env.step(td.set(entries.ACTION, action))["next"]
@@ -28,7 +28,7 @@ def pressing(env, steps):
 @pytest.fixture
 def limited(settings):
     def build(limit, num_envs=3, **options):
-        config = dataclasses.replace(settings("task=wall_touch").task, max_contact_steps=limit, wall_x=0.3)
+        config = dataclasses.replace(settings("task=wall_touch").task, max_contact_steps=limit, wall_x=0.25)
         return make_env(config, ROD, num_envs, seed=0, **options)
 
     return build
@@ -70,12 +70,10 @@ def test_contact_that_ends_an_episode_is_no_success_even_at_the_target(settings)
 
 
 def test_an_evaluation_tells_where_failures_end(limited):
-    env = limited(0, horizon=30)
+    env = limited(0, horizon=60)
 
     def press(td):
-        action = torch.zeros(*td.batch_size, 6, 2)
-        action[..., 0] = 1.0
-        return td.set(entries.ACTION, action)
+        return td.set(entries.ACTION, PRESS.expand(*td.batch_size, 6, 2).clone())
 
     records = evaluate(press, env, deterministic=True, seed=0)
     assert records["contact_failure"].all()

@@ -97,7 +97,7 @@ def test_the_plane_moves_and_turns_within_its_ranges(draw):
 def test_the_dead_end_is_on_either_side_and_closed_on_all_sides(draw):
     task, scene = draw("wall_decoy")
     c, n, wall = task.config, len(task.column_y), scene.cylinders
-    closing = slice(n, n + task._closing)
+    closing = slice(n, n + task.closing)
     assert wall.mask[:, closing].all()
     start, length = wall.start[:, closing], wall.length[:, closing]
     assert torch.allclose(start[..., 0], torch.tensor(c.wall_x + c.dead_end, dtype=torch.float64))

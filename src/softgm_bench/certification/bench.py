@@ -10,6 +10,7 @@ from torch import Tensor
 from softgm_bench.assembly import build_env
 from softgm_bench.config import Config
 from softgm_bench.envs import SoftArmEnv
+from softgm_bench.envs.simulation import Episodes
 from softgm_bench.episodes.certified import dequantised, first_frame
 from softgm_bench.episodes.evaluation import evaluation_seed
 
@@ -49,6 +50,11 @@ class Bench:
         self._first = self.env.simulator.state.episodes.clone()
         self._arms: SoftArmEnv = build_env(self._config, at_once, 0)
         self.scenes, self.steps, self._at_once = scenes, 0, at_once
+
+    @property
+    def beginning(self) -> Episodes:
+        """The scenes' episodes before their first step; not to be changed."""
+        return self._first
 
     @property
     def target(self) -> Tensor:

@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
@@ -19,10 +20,12 @@ from softgm_bench.envs import SoftArmEnv, entries
 from softgm_bench.episodes.certified import Certified, dequantised, physics, quantised
 from softgm_bench.episodes.evaluation import act
 
+Array = NDArray[np.float32]
+
 KEPT = 4  # best sequences of an unsolved scene that are varied further
 NEIGHBOURS = 8  # solved scenes whose sequences are tried in a scene
-AMPLITUDES = (0.03, 0.1, 0.2, 0.4)  # of the noise at a knot, one of these for each child
-KNOTS = (3, 6, 10)  # of the noise, one of these numbers for each child
+AMPLITUDES = (0.05, 0.15, 0.4, 0.8)  # of the noise at a knot, one of these for each child
+KNOTS = (2, 4, 8)  # of the noise, one of these numbers for each child
 
 
 class Search:
@@ -45,7 +48,7 @@ class Search:
         self.tried = torch.zeros(bench.scenes, dtype=torch.int64)
         self._best = torch.zeros((bench.scenes, KEPT, steps, n_agents, 2), dtype=torch.int8)
         self._left = torch.full((bench.scenes, KEPT), torch.inf, dtype=torch.float64)
-        places = torch.cat([bench.privileged, bench.target], dim=-1).double()
+        places = described(bench.privileged, bench.target)
         self._apart = torch.cdist(places, places)
 
     @property
@@ -69,6 +72,23 @@ class Search:
             return
         action = rollout(policy, self.judge.env, rows, self.action.shape[1], sampled, seed)
         self._try(rows, action)
+
+    def borrow(self, other: Certified, scenes: Array, nearest: int) -> None:
+        """Try what succeeds in scenes of another task that are most like each open one.
+
+        Args:
+            other: its scenes.
+            scenes: what ``other`` tells of them, as ``described`` gives it.
+            nearest: sequences to try in each open scene.
+        """
+        rows, steps = self.open, self.action.shape[1]
+        known = torch.from_numpy(np.flatnonzero((other.length > 0) & (other.length <= steps)))
+        if not len(rows) or not len(known):
+            return
+        apart = torch.cdist(described(self.bench.privileged, self.bench.target)[rows], to_tensor(scenes)[known])
+        chosen = known[apart.argsort(dim=1)[:, :nearest]]
+        action = [_padded(quantised(other.actions(int(scene))), steps) for scene in chosen.flatten()]
+        self._try(rows.repeat_interleave(chosen.shape[1]), torch.stack(action))
 
     def generation(self, children: int, scenes: int | None = None) -> None:
         """Try so many new sequences in each open scene; in ``scenes`` of them, drawn at random, if that is less."""
@@ -152,6 +172,11 @@ class Search:
 
     def _draw(self, below: int) -> int:
         return int(torch.randint(below, (), generator=self._generator))
+
+
+def described(privileged: Tensor, target: Tensor) -> Tensor:
+    """Describe scenes by what sequences depend on: a wall's opening, if there is one, and the target, m, float64."""
+    return torch.cat([privileged[:, :3], target], dim=-1).double()
 
 
 def rollout(

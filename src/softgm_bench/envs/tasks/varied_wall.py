@@ -83,11 +83,11 @@ class VariedWall(Wall):
         super().__init__(config)
         self.n_privileged = 5 if config.wall_yaw else 4
         self._cut = self.max_cylinders - len(self.column_y)
-        self._closing = 0
+        self.closing = 0
         if config.dead_end is not None:
-            self._closing = math.ceil(config.opening_side / config.column_spacing - 1e-9) + 2
+            self.closing = math.ceil(config.opening_side / config.column_spacing - 1e-9) + 2
             self._cut = min(2 * self._cut, len(self.column_y))
-        self.max_cylinders = len(self.column_y) + self._closing + self._cut
+        self.max_cylinders = len(self.column_y) + self.closing + self._cut
 
     def sample(self, count: int, generator: torch.Generator, difficulty: Tensor | None = None) -> Scene:
         """Draw ``count`` scenes.
@@ -176,7 +176,7 @@ class VariedWall(Wall):
         if c.dead_end is None:
             return wall
         reach = 0.5 * c.opening_side + c.column_spacing
-        offsets = [c.column_spacing * (i - 0.5 * (self._closing - 1)) for i in range(self._closing)]
+        offsets = [c.column_spacing * (i - 0.5 * (self.closing - 1)) for i in range(self.closing)]
         beside = openings[1][:, :1] + constant(tuple(offsets), device)
         places = torch.stack([beside, (openings[1][:, 1:] - reach).expand_as(beside)], dim=-1)
         start = self._placed(drawn, places, c.dead_end)
