@@ -4,9 +4,9 @@
 
 The ideal blind arm knows the task's distribution and the target, and moves where it wants. A try is a crossing of the
 wall's plane at a point; it passes if the columns beside the opening, and the round ends of those that are cut, are at
-least a clearance away on all sides. The best points are chosen one after the other, each to pass in as many as possible of the openings that remain. For a plane that moves
-and turns, the points are places on the wall, so the arm is taken to know the plane: a bound from above. At a dead end a
-try is lost.
+least a clearance away on all sides. The best points are chosen one after the other, each to pass in as many as possible
+of the openings that remain. For a plane that moves and turns, the points are places on the wall, so the arm is taken to
+know the plane: a bound from above. At a dead end a try is lost.
 
 The second table says how much of the opening the target tells: the coefficient of determination of its place along the
 wall and of its height on held-out scenes, by a linear fit and by the mean of the nearest 50 of the scenes. ``wall``

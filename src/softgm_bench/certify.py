@@ -88,8 +88,8 @@ def _certify(arguments: list[str]) -> None:
     if not kind_of(config.task).has_arm:
         raise UserError(f"task={config.task.name}: there is no arm in it")
     path = Path(options.out or certified.FOLDER / f"{config.task.name}.npz")
-    benches = [Bench(config, options.episodes, options.seed, dtype) for dtype in ("float32", "float64")]
-    search = Search(*benches, steps=options.steps, seed=options.seed)
+    bench, judge = (Bench(config, options.episodes, options.seed, dtype) for dtype in ("float32", "float64"))
+    search = Search(bench, judge, options.steps, options.seed)
     if path.exists():
         _resume(search, path, config, options)
 

@@ -32,15 +32,13 @@ def in_wall(scene, points):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_target_says_nothing_about_the_opening(draw, name):
-    task, scene = draw(name)
+    _, scene = draw(name)
     opening, target = scene.privileged[:, 1:3], scene.target
-    design = torch.cat([torch.ones(COUNT, 1), target, target.square(), target[:, :2] * target[:, 1:]], dim=-1).double()
+    powers = (torch.ones(COUNT, 1, dtype=target.dtype), target, target.square(), target[:, :2] * target[:, 1:])
+    design = torch.cat(powers, dim=-1)
     rest = opening - design @ torch.linalg.lstsq(design, opening).solution
     explained = 1.0 - rest.var(dim=0) / opening.var(dim=0)
     assert (explained < 0.02).all()  # 9 numbers fitted to 2000 values of chance explain 0.005
-    # the opening's distribution is one that depends on nothing but the task
-    fixed, _ = draw(name)
-    assert torch.equal(fixed.sample(COUNT, torch.Generator().manual_seed(0)).privileged, scene.privileged)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -60,7 +60,9 @@ class Search:
         """Go on from what an earlier search found; what does not succeed any more is searched again."""
         steps = self.action.shape[1]
         rows = torch.from_numpy(np.flatnonzero((known.length > 0) & (known.length <= steps)))
-        action = torch.stack([_padded(quantised(known.actions(int(row))), steps) for row in rows]) if len(rows) else None
+        action = (
+            torch.stack([_padded(quantised(known.actions(int(row))), steps) for row in rows]) if len(rows) else None
+        )
         self.tried.copy_(to_tensor(known.tried))
         if action is not None:
             self._decide(rows, action)
@@ -217,5 +219,3 @@ def run(search: Search, out_of_time: Callable[[], bool], children: int, after: C
 
 def _padded(action: Tensor, steps: int) -> Tensor:
     return torch.cat([action, action[-1:].expand(steps - len(action), -1, -1)])
-
-

@@ -84,8 +84,8 @@ def make_judge(n_nodes: int, n_agents: int, real: type) -> Callable[..., Any]:
     """
 
     def kernel(
-        before, after, target, action, previous_action, touching, new_bins, broken, terminated, truncated, steps, contact_steps,
-        numbers, flags, clocks, c, horizon, limit,
+        before, after, target, action, previous_action, touching, new_bins, broken, terminated, truncated, steps,
+        contact_steps, numbers, flags, clocks, c, horizon, limit,
     ):  # fmt: skip
         b = cuda.blockIdx.x * cuda.blockDim.x + cuda.threadIdx.x
         if b < steps.shape[0]:

@@ -134,19 +134,18 @@ def of_task(name: str) -> Certified | None:
     return load(path) if path.exists() else None
 
 
-def mask(
-    config: Config, episodes: int, seed: int, batch: int | None, horizon: int | None
-) -> NDArray[np.bool_] | None:
+def mask(config: Config, episodes: int, seed: int, batch: int | None, horizon: int | None) -> NDArray[np.bool_] | None:
     """Tell which episodes of an evaluation play a certified scene, ``(episodes,)``.
 
     None where that says nothing: the task has no file, its physics are others, or no scene of the evaluation is known.
     """
     known = of_task(config.task.name)
-    if known is None or known.physics != physics(build_env(config, 1, 0)):
+    if known is None or config.device != "cpu" or known.physics != physics(build_env(config, 1, 0)):
         return None
     limit = horizon or config.task.horizon
-    table = {_key(*row[:2]): 0 < row[2] <= limit for row in zip(known.target, known.privileged, known.length, strict=True)}
-    keys = [_key(*row) for row in zip(*scenes(config, episodes, seed, batch), strict=True)]
+    solved = (known.length > 0) & (known.length <= limit)
+    table = dict(zip(map(_key, known.target, known.privileged), solved.tolist(), strict=True))
+    keys = list(map(_key, *scenes(config, episodes, seed, batch)))
     if not any(key in table for key in keys):
         return None
     return np.array([table.get(key, False) for key in keys])

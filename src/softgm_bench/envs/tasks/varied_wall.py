@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -30,7 +31,8 @@ class VariedWallConfig(WallConfig):
         super().__post_init__()
         if not 0.0 <= self.wall_x_spread < self.wall_x:
             raise ValueError(
-                f"task.wall_x_spread is {self.wall_x_spread}: it must be at least 0 and below task.wall_x, {self.wall_x}"
+                f"task.wall_x_spread is {self.wall_x_spread}: "
+                f"it must be at least 0 and below task.wall_x, {self.wall_x}"
             )
         if not 0.0 <= self.wall_yaw < 90.0:
             raise ValueError(f"task.wall_yaw is {self.wall_yaw}: it must be at least 0 and below 90 degrees")
@@ -72,7 +74,7 @@ class VariedWall(Wall):
     A scene's ``privileged``: the opening's centre and side, m; where there is a yaw, also that, rad.
     """
 
-    config_class = VariedWallConfig
+    config_class: ClassVar[type[VariedWallConfig]] = VariedWallConfig
 
     def __init__(self, config: VariedWallConfig) -> None:
         """Lay out the columns.
@@ -161,9 +163,7 @@ class VariedWall(Wall):
     def _farthest(self, opening: Tensor) -> Tensor:
         """Length of the way from the base through a point, m, ``(n, 3)``, to the farthest target, ``(n,)``."""
         c = self.config
-        corners = constant(
-            tuple((x, y, z) for x in c.target_x for y in c.target_y for z in c.target_z), opening.device
-        )
+        corners = constant(tuple((x, y, z) for x in c.target_x for y in c.target_y for z in c.target_z), opening.device)
         return opening.norm(dim=-1) + (corners - opening.unsqueeze(1)).norm(dim=-1).amax(dim=-1)
 
     def _cylinders(self, drawn: Tensor, openings: list[Tensor], side: Tensor) -> Cylinders:

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -59,7 +60,7 @@ class Wall(Task):
     A scene's ``privileged``: the opening's centre and side, m.
     """
 
-    config_class = WallConfig
+    config_class: ClassVar[type[WallConfig]] = WallConfig
     n_privileged = 4
     n_points = 1
 
