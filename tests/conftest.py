@@ -16,7 +16,7 @@ torch.set_num_threads(1 if "PYTEST_XDIST_WORKER" in os.environ else 2)
 progress.SECONDS_BETWEEN_LINES = float("inf")
 compilation.told()
 
-TASKS = ("basic", "structured", "wall", "wall_narrow", "wall_fixed")
+TASKS = ("basic", "structured", "wall", "wall_narrow", "wall_fixed", "wall_touch", "wall_search", "wall_decoy")
 
 
 @pytest.fixture(scope="session")

@@ -11,6 +11,7 @@ import pytest
 import yaml
 from omegaconf import OmegaConf
 
+from conftest import TASKS
 from softgm_bench.config import compose_untyped
 
 ROOT = Path(__file__).parents[1]
@@ -74,7 +75,7 @@ def settings_of(task):
     return {key: value for key, value in composed.items() if key not in ("name", "curriculum")}
 
 
-@pytest.mark.parametrize("task", ["basic", "structured", "wall", "wall_narrow", "wall_fixed"])
+@pytest.mark.parametrize("task", TASKS)
 def test_the_tables_of_a_task_are_its_settings(task):
     tables = task_tables()
     inherited = {} if task in ("basic", "structured", "wall") else tables["wall"]

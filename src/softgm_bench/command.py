@@ -76,12 +76,26 @@ def parse(
     if len(paths) != 1 or paths[0].startswith("-"):
         found = f"found {', '.join(paths)}" if paths else "found none"
         raise UserError(f"give one {source}, {found}; settings are written key=value, --help lists them")
+    own, rest = split([argument for argument in arguments if argument not in paths], options, others=others)
+    return Path(paths[0]), own, rest
+
+
+def split(arguments: list[str], options: type[Options], *, others: bool = False) -> tuple[Options, list[str]]:
+    """Split settings into the command's own and, as they were written, others.
+
+    Args:
+        arguments: ``key=value`` each.
+        options: dataclass of the command's own settings, each with a default.
+        others: whether settings of a trained policy (``CHANGEABLE``) may be among them.
+
+    Raises:
+        UserError: an unknown setting, or a value of the wrong type.
+    """
     names = [field.name for field in fields(options)]  # type: ignore[arg-type]
     own: list[str] = []
     rest: list[str] = []
     for argument in arguments:
-        if argument not in paths:
-            (own if argument.partition("=")[0] in names else rest).append(argument)
+        (own if argument.partition("=")[0] in names else rest).append(argument)
     for key in (setting.partition("=")[0] for setting in rest):
         if not others or key.partition(".")[0] not in CHANGEABLE:
             known = [*names, *(CHANGEABLE if others else ())]
@@ -95,4 +109,4 @@ def parse(
     except OmegaConfBaseException as error:
         raise UserError(f"{error.full_key}: {str(error).splitlines()[0]}") from error
     check_finite(OmegaConf.to_container(merged))
-    return Path(paths[0]), cast(Options, OmegaConf.to_object(merged)), rest
+    return cast(Options, OmegaConf.to_object(merged)), rest

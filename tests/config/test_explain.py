@@ -23,7 +23,8 @@ def test_values_of_the_wrong_type_are_refused():
 
 
 def test_unknown_choices_list_the_known_ones():
-    tasks = "basic, structured, vmas_balance, vmas_navigation, wall, wall_fixed, wall_narrow"
+    walls = "wall, wall_decoy, wall_fixed, wall_narrow, wall_search, wall_touch"
+    tasks = f"basic, structured, vmas_balance, vmas_navigation, {walls}"
     assert refusal("task=wal") == f"task=wal: no such task; choose one of {tasks}"
     assert refusal("experiment=fast") == "experiment=fast: no such experiment; choose one of default, gpu, quick, smoke"
     models = "mlp, softgm, softgm_no_stage1, softgm_no_stage2, softgm_remember, vector_mlp"

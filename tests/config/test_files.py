@@ -3,6 +3,7 @@
 import pytest
 from omegaconf import DictConfig, OmegaConf
 
+from conftest import TASKS
 from softgm_bench.algorithms import algorithm_configs
 from softgm_bench.assembly import configure
 from softgm_bench.config import compose, config_directory, plain
@@ -49,7 +50,7 @@ def test_every_algorithm_has_both_recipes(algo, recipe):
 
 
 def test_only_the_tuned_recipe_has_what_walls_need_and_only_on_walls():
-    for task in ("basic", "structured", "wall", "wall_narrow", "wall_fixed"):
+    for task in TASKS:
         for recipe in ("paper", "tuned"):
             config = compose([f"task={task}", f"recipe={recipe}"])
             expected = recipe == "tuned" and task.startswith("wall")

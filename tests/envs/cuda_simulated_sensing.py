@@ -55,7 +55,7 @@ def _kernels(monkeypatch):
     assert launches
 
 
-@pytest.mark.parametrize("name", ["wall", "structured"])
+@pytest.mark.parametrize("name", ["wall", "structured", "wall_search", "wall_decoy"])
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_discovery_adds_up_in_the_tasks_scenes(settings, name, dtype):
     task = make_task(settings(f"task={name}").task)

@@ -1,5 +1,6 @@
 """Steps with CUDA kernels under Numba's simulator against tensors; run by ``test_cuda_kernels.py``."""
 
+import dataclasses
 from unittest import mock
 
 import pytest
@@ -38,18 +39,26 @@ def random_step(dtype: torch.dtype, num_envs: int) -> Step:
         terminated=draw() > 0.8,
         truncated=draw() > 0.8,
         steps=(10.0 * draw()).abs().long(),
+        contact_steps=(6.0 * draw()).abs().long(),
     )
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("num_envs", [1, 200])  # with and without a last block that is not full
-def test_the_kernel_judges_as_tensors_do(settings, dtype, num_envs):
-    step, config = random_step(dtype, num_envs), settings("task=wall").task
+@pytest.mark.parametrize("task", ["wall", "wall_touch"])  # without and with a limit of contact
+def test_the_kernel_judges_as_tensors_do(settings, dtype, num_envs, task):
+    step, config = random_step(dtype, num_envs), settings(f"task={task}").task
+    config = dataclasses.replace(config, max_contact_steps=3) if task == "wall_touch" else config
     with force_dense():
         found = judge(step, config, 8)
     expected = judge_dense(step, config, 8)
-    for name in ("success", "ended", "terminated", "truncated", "steps"):
+    for name in ("success", "ended", "terminated", "truncated", "steps", "contact_steps"):
         assert torch.equal(getattr(found, name), getattr(expected, name)), name
+    if task == "wall":
+        assert found.contact_failure is expected.contact_failure is None
+    else:
+        assert torch.equal(found.contact_failure, expected.contact_failure)
+        assert num_envs == 1 or 0 < found.contact_failure.sum() < num_envs
     rounding = 1e-5 if dtype == torch.float32 else 1e-6  # progress is a difference of distances, times a coefficient
     for key, value in expected.numbers.items():
         assert found.numbers[key].shape == (num_envs, 1)
@@ -58,7 +67,7 @@ def test_the_kernel_judges_as_tensors_do(settings, dtype, num_envs):
         assert all(0 < getattr(found, name).sum() < num_envs for name in ("success", "ended", "terminated"))
 
 
-@pytest.mark.parametrize("task", ["basic", "structured", "wall"])
+@pytest.mark.parametrize("task", ["basic", "structured", "wall", "wall_touch", "wall_search", "wall_decoy"])
 def test_an_environment_with_kernels_plays_the_episodes_of_one_without_and_waits_for_nothing(settings, task):
     def play(kernels: bool):
         parameters = RodParameters(n_elements=8, substeps=4)

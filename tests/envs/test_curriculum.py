@@ -16,7 +16,7 @@ from softgm_bench.envs.tasks import make_task
 from softgm_bench.envs.tasks.base import CurriculumConfig, eased
 from softgm_bench.errors import UserError
 
-TASKS = ("basic", "structured", "wall", "wall_narrow", "wall_fixed")
+TASKS = ("basic", "structured", "wall", "wall_narrow", "wall_fixed", "wall_touch", "wall_search", "wall_decoy")
 ENABLED = "task.curriculum.enabled=true"
 FOUR = CurriculumConfig(enabled=True, stages=2, episodes=4, promote=0.6, demote=0.2)
 

@@ -16,6 +16,7 @@ CONFIG = RewardConfig(
     lambda_s=0.05,
     epsilon=1e-4,
     lambda_succ=50.0,
+    lambda_fail=0.0,
 )
 
 

@@ -6,7 +6,7 @@ from softgm_bench.envs import entries, make_env
 from softgm_bench.models.heads import build_actor
 from softgm_bench.rod.parameters import RodParameters
 
-TASKS = ("basic", "structured", "wall", "wall_narrow", "wall_fixed")
+TASKS = ("basic", "structured", "wall", "wall_narrow", "wall_fixed", "wall_touch", "wall_search", "wall_decoy")
 SHORT = RodParameters(substeps=10)  # a tenth of a control step: these tests are about the environment
 
 

@@ -4,6 +4,7 @@ import math
 import pytest
 import torch
 
+from conftest import TASKS
 from dense import force_dense
 from softgm_bench.envs.tasks import make_task
 from softgm_bench.envs.tasks.base import first_accepted
@@ -21,7 +22,7 @@ def draw(settings):
     return sample
 
 
-@pytest.mark.parametrize("name", ["basic", "structured", "wall", "wall_narrow", "wall_fixed"])
+@pytest.mark.parametrize("name", TASKS)
 def test_same_seed_draws_the_same_scenes_and_another_seed_others(draw, name):
     _, _, first = draw(name)
     _, _, again = draw(name)

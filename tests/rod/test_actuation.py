@@ -1,3 +1,5 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -48,6 +50,18 @@ def test_an_element_receives_the_couple_per_length_times_its_length():
     assert (couple[0, [0, 2]] == 0.0).all()
     per_element = Actuation(ARM, 6, 25.0, scaling="per_element").couple(action)
     assert np.allclose(per_element, couple * 60)
+
+
+def largest(basis):
+    """The largest torque along the arm for amplitudes in [-1, 1]: the maximum of the sum of absolute values."""
+    return float(np.abs(torque_basis(6, np.linspace(0.0, 1.0, 100_001), 1.0, basis)).sum(axis=0).max())
+
+
+def test_between_control_points_the_interpolating_basis_exceeds_the_limit_as_the_page_says():
+    assert largest("interpolating") == pytest.approx(1.67, abs=0.005)
+    assert largest("bspline") <= 1.0 + 1e-12
+    page = (Path(__file__).parents[2] / "docs/environment.md").read_text()
+    assert f"{largest('interpolating'):.2f}" in page
 
 
 @pytest.mark.parametrize(

@@ -45,7 +45,8 @@ def parallel_env(
     """Build one arm with settings from ``conf/``.
 
     Args:
-        task: ``basic``, ``structured``, ``wall``, ``wall_narrow`` or ``wall_fixed``.
+        task: ``basic``, ``structured``, ``wall``, ``wall_narrow``, ``wall_fixed``, ``wall_touch``, ``wall_search`` or
+            ``wall_decoy``.
         seed: of the scenes until ``reset(seed=...)`` gives another; None: from the operating system.
         render_mode: ``rgb_array`` or None.
         horizon: control steps until truncation, the task's by default.

@@ -210,8 +210,10 @@ def _final_horizon(config: Mapping[str, Any]) -> int:
 
 
 def _longest_failure(episodes: Columns) -> int | None:
-    """Length of an episode that ended with neither success nor divergence: only the time limit ends it so."""
+    """Length of an episode that ended with neither success nor a failure of its own: only the time limit ends it so."""
     timed_out = (episodes["success"] == 0) & (episodes["diverged"] == 0)
+    if "contact_failure" in episodes:
+        timed_out &= episodes["contact_failure"] == 0
     return int(episodes["length"][timed_out].max()) if timed_out.any() else None
 
 

@@ -17,6 +17,8 @@ from softgm_bench.rod.stability import check_time_step
 
 SCENES = 1024  # of a check
 
+SURFACE = ("friction_coefficient", "velocity_damping_coefficient")  # a task's own in place of the rod's, unless null
+
 
 def make_env(
     task_config: TaskConfig,
@@ -36,7 +38,8 @@ def make_env(
     ``curriculum``: for training alone, follow the task's if it is enabled; otherwise all scenes are the task's own.
     ``backend`` is a name that ``make_backend`` knows; None: the fused kernel of the device.
     """
-    rod = make_backend(backend or default_backend(torch.device(device).type), rod_parameters)
+    own = {name: getattr(task_config, name) for name in SURFACE if getattr(task_config, name) is not None}
+    rod = make_backend(backend or default_backend(torch.device(device).type), replace(rod_parameters, **own))
     if not curriculum:
         task_config = replace(task_config, curriculum=replace(task_config.curriculum, enabled=False))
     return SoftArmEnv(make_task(task_config), rod, num_envs, seed, horizon, device, dtype, stagger, perturbation)

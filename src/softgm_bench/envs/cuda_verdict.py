@@ -18,7 +18,7 @@ from softgm_bench.rod.cuda_kernel import device
 from softgm_bench.rod.cuda_launch import REAL, launch
 
 THREADS = 64  # of a block
-N_NUMBERS, N_FLAGS = 14, 4
+N_NUMBERS, N_FLAGS, N_CLOCKS = 14, 5, 2
 
 
 class Coefficients(NamedTuple):
@@ -36,11 +36,12 @@ class Coefficients(NamedTuple):
     lambda_s: Any
     epsilon: Any
     lambda_succ: Any
+    lambda_fail: Any
 
 
 def judge(
     step: Sequence[Tensor], config: TaskConfig, horizon: int
-) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...], Tensor]:
+) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...], tuple[Tensor, ...]]:
     """Judge a step of every environment, in one launch.
 
     Args:
@@ -49,14 +50,16 @@ def judge(
         horizon: control steps until truncation.
 
     Returns:
-        The numbers in the order of ``verdict.NUMBERS``, ``(num_envs, 1)`` float32 each; success, ended, terminated and
-        truncated, ``(num_envs,)`` bool each; the steps, ``(num_envs,)`` int64.
+        The numbers in the order of ``verdict.NUMBERS``, ``(num_envs, 1)`` float32 each; success, ended, terminated,
+        truncated and failure by contact, ``(num_envs,)`` bool each; the steps and those in contact, ``(num_envs,)``
+        int64 each.
     """
     num_envs, _, n_nodes = step[0].shape
     here = step[0].device
     numbers = torch.empty((N_NUMBERS, num_envs), dtype=torch.float32, device=here)
     flags = torch.empty((N_FLAGS, num_envs), dtype=torch.bool, device=here)
-    steps = torch.empty(num_envs, dtype=torch.int64, device=here)
+    clocks = torch.empty((N_CLOCKS, num_envs), dtype=torch.int64, device=here)
+    limit = -1 if config.max_contact_steps is None else config.max_contact_steps
     real = REAL[step[0].dtype]
     settings = vars(config.reward) | {"success_radius": config.success_radius}
     settings |= {"max_torque": config.actuation.max_torque}
@@ -64,41 +67,46 @@ def judge(
         make_judge(n_nodes, step[3].shape[1], real),
         -(-num_envs // THREADS),
         THREADS,
-        [*(value.contiguous() for value in step), numbers, flags, steps],
+        [*(value.contiguous() for value in step), numbers, flags, clocks],
         Coefficients(*(real(settings[name]) for name in Coefficients._fields)),
         horizon,
+        limit,
     )
-    return numbers.unsqueeze(-1).unbind(0), flags.unbind(0), steps
+    return numbers.unsqueeze(-1).unbind(0), flags.unbind(0), clocks.unbind(0)
 
 
 @lru_cache
 def make_judge(n_nodes: int, n_agents: int, real: type) -> Callable[..., Any]:
     """Build the kernel for one size of arm and one precision; launch with ``THREADS`` environments a block.
 
-    Arguments: the fields of ``verdict.Step``, the three results of ``judge``, ``Coefficients``, the horizon.
+    Arguments: the fields of ``verdict.Step``, the three results of ``judge``, ``Coefficients``, the horizon,
+    the most steps in contact, negative without a limit.
     """
 
     def kernel(
         before, after, target, action, previous_action, touching, new_bins, broken, terminated, truncated, steps,
-        numbers, flags, clock, c, horizon,
+        contact_steps, numbers, flags, clocks, c, horizon, limit,
     ):  # fmt: skip
         b = cuda.blockIdx.x * cuda.blockDim.x + cuda.threadIdx.x
         if b < steps.shape[0]:
             active = not (terminated[b] or truncated[b])
             distance = tip_to(after[b], target[b])
-            success = distance < c.success_radius and not broken[b]
-            clock[b] = steps[b] + (1 if active else 0)
-            over = terminated[b] or (active and (success or broken[b]))
-            late = truncated[b] or (active and clock[b] >= horizon and not over)
-            flags[0, b], flags[1, b], flags[2, b], flags[3, b] = success, active and (over or late), over, late
             contacts = 0
             for k in range(n_nodes):
                 contacts += 1 if touching[b, k] else 0
+            clocks[0, b] = steps[b] + (1 if active else 0)
+            clocks[1, b] = contact_steps[b] + (1 if active and contacts > 0 else 0)
+            failure = active and limit >= 0 and clocks[1, b] > limit
+            success = distance < c.success_radius and not broken[b] and not failure
+            over = terminated[b] or (active and (success or broken[b] or failure))
+            late = truncated[b] or (active and clocks[0, b] >= horizon and not over)
+            flags[0, b], flags[1, b], flags[2, b], flags[3, b] = success, active and (over or late), over, late
+            flags[4, b] = failure
             numbers[0, b], numbers[1, b], numbers[2, b] = distance, tip_step(before[b], after[b]), contacts
             numbers[3, b], numbers[4, b] = torques(c, action[b])
             change = effort_change(action[b], previous_action[b])
             progress = tip_to(before[b], target[b]) - distance
-            reward(c, numbers[5:, b], distance, progress, change, contacts, new_bins[b], success)
+            reward(c, numbers[5:, b], distance, progress, change, contacts, new_bins[b], success, failure)
 
     callees = {
         "tip_to": device(_make_tip_to(n_nodes, real)),
@@ -165,7 +173,7 @@ def _make_effort_change(n_agents: int, real: type) -> Callable[..., Any]:
 def _make_reward(real: type) -> Callable[..., Any]:
     zero, one = real(0.0), real(1.0)
 
-    def reward(c, out, distance, progress, change, contacts, new_bins, success):
+    def reward(c, out, distance, progress, change, contacts, new_bins, success, failure):
         """The reward, and behind it its terms as in ``reward.reward_terms``."""
         touching = one if contacts > 0 else zero
         still = one if abs(progress) < c.epsilon else zero
@@ -175,7 +183,7 @@ def _make_reward(real: type) -> Callable[..., Any]:
         second = c.lambda_p * progress
         third = -c.lambda_da * change
         fourth = -c.lambda_t
-        fifth = c.lambda_c * touching + c.lambda_cn * real(contacts)
+        fifth = c.lambda_c * touching + c.lambda_cn * real(contacts) - (c.lambda_fail if failure else zero)
         sixth = c.lambda_d * found
         seventh = -c.lambda_s * touching * still
         eighth = c.lambda_succ if success else zero

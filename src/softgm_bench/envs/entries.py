@@ -114,13 +114,16 @@ NEXT_MEMORY = ("next", *MEMORY)
 
 REWARD = _entry("reward", episode={"discounted_return": DISCOUNTED, "undiscounted_return": SUM})  # the team's
 DONE = _entry("done", dtype=torch.bool, episode={"length": STEPS})
-TERMINATED = _entry("terminated", dtype=torch.bool)  # success or divergence
+TERMINATED = _entry("terminated", dtype=torch.bool)  # success, divergence or too much contact
 TRUNCATED = _entry("truncated", dtype=torch.bool)  # the horizon alone
 IS_INIT = _entry("is_init", dtype=torch.bool)  # an episode's first frame: nothing may be remembered
 
 # Metrics, which no policy reads.
 SUCCESS = _entry("info", "success", dtype=torch.bool, episode={"success": EVER})
 DIVERGED = _entry("info", "diverged", dtype=torch.bool, episode={"diverged": EVER})
+CONTACT_FAILURE = _entry(  # too many steps of contact ended the episode; only where there is a limit
+    "info", "contact_failure", dtype=torch.bool, episode={"contact_failure": EVER}
+)
 TIP_STEP = _entry(  # way of the tip in this control step, m
     "info", "tip_step", episode={"tip_travel_distance": SUM, "final_tip_step": RECENT}
 )
@@ -151,7 +154,8 @@ REWARD_TERM_NAMES = ("distance", "progress", "smoothness", "time", "collision", 
 for _name in REWARD_TERM_NAMES:
     _entry(REWARD_TERMS, _name, episode={f"reward_{_name}": SUM}, iteration=(f"reward_{_name}", MEAN))
 
-INFO = tuple(key for key in TABLE if key[0] == "info" and key != DIFFICULTY)
+OPTIONAL = (DIFFICULTY, CONTACT_FAILURE)
+INFO = tuple(key for key in TABLE if key[0] == "info" and key not in OPTIONAL)
 EPISODE_COLUMNS = tuple(column for entry in TABLE.values() for column in entry.episode)
 ITERATION_COLUMNS = tuple(entry.iteration for entry in TABLE.values() if entry.iteration is not None)
 

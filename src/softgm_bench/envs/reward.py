@@ -15,6 +15,7 @@ def reward_terms(
     contact_nodes: Tensor,
     new_bins: Tensor,
     success: Tensor,
+    contact_failure: Tensor | None = None,
 ) -> dict[str, Tensor]:
     """All terms with their signs, so that the reward is their sum.
 
@@ -27,6 +28,7 @@ def reward_terms(
         contact_nodes: C_t, rod nodes in contact, ``(num_envs,)``.
         new_bins: N_t^new, bins discovered in this step, ``(num_envs,)``.
         success: d_t below the success radius, ``(num_envs,)`` bool.
+        contact_failure: whether too much contact has ended the episode, ``(num_envs,)`` bool; None: it cannot.
 
     Returns:
         Terms by the names in ``entries.REWARD_TERM_NAMES``, ``(num_envs,)`` each.
@@ -34,13 +36,16 @@ def reward_terms(
     progress = previous_distance - distance
     touching = (contact_nodes > 0).to(distance.dtype)
     still = (progress.abs() < config.epsilon).to(distance.dtype)
+    collision = config.lambda_c * touching + config.lambda_cn * contact_nodes
+    if contact_failure is not None:
+        collision = collision - config.lambda_fail * contact_failure.to(distance.dtype)
     change = (action - previous_action).to(distance.dtype).square().mean(dim=(-2, -1))
     return {
         "distance": -distance,
         "progress": config.lambda_p * progress,
         "smoothness": -config.lambda_da * change,
         "time": torch.full_like(distance, -config.lambda_t),
-        "collision": config.lambda_c * touching + config.lambda_cn * contact_nodes,
+        "collision": collision,
         "discovery": config.lambda_d * new_bins.clamp(max=config.k_max).to(distance.dtype),
         "stuck": -config.lambda_s * touching * still,
         "success": config.lambda_succ * success.to(distance.dtype),

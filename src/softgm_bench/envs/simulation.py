@@ -39,7 +39,8 @@ class Episodes(TensorClass):
         table: discovered bins.
         previous_action: as the sections applied it, ``(num_envs, n_agents, 2)`` float32; 0 after a reset.
         steps: control steps since the reset, ``(num_envs,)`` int64.
-        terminated: success or divergence, ``(num_envs,)`` bool.
+        contact_steps: those of them that ended in contact, where the task limits them, ``(num_envs,)`` int64.
+        terminated: success, divergence or too much contact, ``(num_envs,)`` bool.
         truncated: the horizon, ``(num_envs,)`` bool.
         difficulty: of the scene, from 0 to 1, the task's own, ``(num_envs,)`` float32.
     """
@@ -50,6 +51,7 @@ class Episodes(TensorClass):
     table: SlotTable
     previous_action: Tensor
     steps: Tensor
+    contact_steps: Tensor
     terminated: Tensor
     truncated: Tensor
     difficulty: Tensor
@@ -245,6 +247,7 @@ class Simulator:
             table=blank.table,
             previous_action=blank.previous_action,
             steps=blank.table.count,
+            contact_steps=blank.table.count,
             terminated=blank.never,
             truncated=blank.never,
             difficulty=blank.whole if level is None else level.to(torch.float32).expand(count),
@@ -319,9 +322,11 @@ class Simulator:
             terminated=now.terminated,
             truncated=now.truncated,
             steps=now.steps,
+            contact_steps=now.contact_steps,
         )
         verdict = judge(step, config, self.horizon)
         now.steps, now.terminated, now.truncated = verdict.steps, verdict.terminated, verdict.truncated
+        now.contact_steps = verdict.contact_steps
         if self.curriculum:
             state.progress = note_ends(state.progress, verdict.ended, verdict.success, config.curriculum)
         return Outcome(sight=sight, broken=broken, verdict=verdict)

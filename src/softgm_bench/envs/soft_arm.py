@@ -36,7 +36,8 @@ class SoftArmEnv(RememberingEnv):
     One step is one control step of the rod. An environment that is done does not move until it is reset. Resets are
     partial (TorchRL's ``_reset`` mask) and draw scenes from the environment's own generator. A state that is not
     finite, or an element whose dilatation leaves the task's range, terminates that environment alone as ``diverged``;
-    its last good state is what is observed.
+    its last good state is what is observed. Where the task limits contact, the step in which an arm has touched
+    obstacles at the end of more control steps than ``max_contact_steps`` ends its episode as failed.
 
     Attributes:
         sizes: of actions and observations.
@@ -83,7 +84,15 @@ class SoftArmEnv(RememberingEnv):
         if not stagger:
             self.simulator.seed(seed)  # a seed means the same scenes here as in ``set_seed``
         curriculum, perturbed = self.simulator.curriculum, self.simulator.perturbation is not None
-        specs = make_specs(num_envs, self.sizes, self.device, curriculum=curriculum, perturbed=perturbed)
+        self._limited = task.config.max_contact_steps is not None
+        specs = make_specs(
+            num_envs,
+            self.sizes,
+            self.device,
+            curriculum=curriculum,
+            perturbed=perturbed,
+            contact_limit=self._limited,
+        )
         for name, spec in specs.items():
             setattr(self, name, spec)
 
@@ -156,7 +165,8 @@ class SoftArmEnv(RememberingEnv):
         outcome = self.simulator.step(tensordict.get(entries.ACTION).clamp(-1.0, 1.0))
         verdict = outcome.verdict
         begins = torch.zeros_like(outcome.broken)
-        return self._frame(episodes, outcome.sight, verdict.numbers, verdict.success, outcome.broken, begins)
+        endings = (verdict.success, outcome.broken, verdict.contact_failure)
+        return self._frame(episodes, outcome.sight, verdict.numbers, *endings, begins)
 
     # frames
 
@@ -170,7 +180,7 @@ class SoftArmEnv(RememberingEnv):
             **dict.fromkeys((entries.TIP_STEP, entries.TORQUE_PER_AGENT, entries.TORQUE_JOINT), zero),
             **{(entries.REWARD_TERMS, name): zero for name in entries.REWARD_TERM_NAMES},
         }
-        return self._frame(episodes, sight, numbers, never, never, torch.ones_like(never))
+        return self._frame(episodes, sight, numbers, never, never, never, torch.ones_like(never))
 
     def _frame(
         self,
@@ -179,6 +189,7 @@ class SoftArmEnv(RememberingEnv):
         numbers: Mapping[NestedKey, Tensor],
         success: Tensor,
         broken: Tensor,
+        contact_failure: Tensor | None,
         begins: Tensor,
     ) -> TensorDict:
         """Make everything that a step or a reset writes, in tensors of its own.
@@ -218,6 +229,8 @@ class SoftArmEnv(RememberingEnv):
             **columns,
             **dict(zip(numbers, _columns(*numbers.values()), strict=True)),
         }
+        if self._limited and contact_failure is not None:
+            values[entries.CONTACT_FAILURE] = contact_failure.unsqueeze(-1)
         if self.sizes.n_privileged:
             values[entries.PRIVILEGED] = episodes.scene.privileged.to(torch.float32, copy=True)
         return entries.frame(values, episodes.batch_size, self.sizes, self.device)

@@ -11,7 +11,13 @@ ENDS = (entries.DONE, entries.TERMINATED, entries.TRUNCATED)
 
 
 def make_specs(
-    num_envs: int, sizes: Sizes, device: torch.device, *, curriculum: bool = False, perturbed: bool = False
+    num_envs: int,
+    sizes: Sizes,
+    device: torch.device,
+    *,
+    curriculum: bool = False,
+    perturbed: bool = False,
+    contact_limit: bool = False,
 ) -> dict[str, TensorSpec]:
     """Make the specs of the arm's environment, each with the batch dimension, by the name of ``EnvBase``'s attribute.
 
@@ -20,11 +26,13 @@ def make_specs(
         sizes: without privileged numbers their entry is absent.
         device: of all entries.
         curriculum: whether scenes have a difficulty; without one its entry is absent.
+        contact_limit: whether contact can end an episode; without a limit its entry is absent.
         perturbed: whether the previous action that agents observe may leave its bounds.
     """
     absent = {entries.ACTION, entries.REWARD, *ENDS}
     absent |= set() if sizes.n_privileged else {entries.PRIVILEGED}
     absent |= set() if curriculum else {entries.DIFFICULTY}
+    absent |= set() if contact_limit else {entries.CONTACT_FAILURE}
 
     def spec(key: NestedKey) -> TensorSpec:
         entry, shape = entries.TABLE[key], (num_envs, *entries.shape_of(key, sizes))

@@ -30,6 +30,7 @@ class Step(NamedTuple):
         terminated: before the step, bool.
         truncated: before the step, bool.
         steps: before the step, int64.
+        contact_steps: steps of the episode so far that ended in contact, int64.
     """
 
     before: Tensor
@@ -43,17 +44,20 @@ class Step(NamedTuple):
     terminated: Tensor
     truncated: Tensor
     steps: Tensor
+    contact_steps: Tensor
 
 
 class Verdict(NamedTuple):
     """The verdict on a step; ``(num_envs,)`` each.
 
     Attributes:
-        success: whether the tip is within the task's radius, bool.
+        success: whether the tip is within the task's radius, and contact has not ended the episode, bool.
         ended: episodes that ended with this step, bool.
         terminated: after the step, bool.
         truncated: after the step, bool.
         steps: after the step, int64.
+        contact_steps: after the step, int64; without a limit as before it, since nobody counts.
+        contact_failure: whether this step's contact was one too many, bool; None without a limit.
         numbers: entries of the frame by key, of any type of numbers, or ``(num_envs, 1)`` float32 already.
     """
 
@@ -62,6 +66,8 @@ class Verdict(NamedTuple):
     terminated: Tensor
     truncated: Tensor
     steps: Tensor
+    contact_steps: Tensor
+    contact_failure: Tensor | None
     numbers: dict[NestedKey, Tensor]
 
 
@@ -72,8 +78,19 @@ def judge(step: Step, config: TaskConfig, horizon: int) -> Verdict:
         return judge_dense(step, config, horizon)
     from softgm_bench.envs import cuda_verdict  # only where Numba's CUDA target is
 
-    columns, (success, ended, terminated, truncated), steps = cuda_verdict.judge(step, config, horizon)
-    return Verdict(success, ended, terminated, truncated, steps, dict(zip(NUMBERS, columns, strict=True)))
+    columns, flags, (steps, contact_steps) = cuda_verdict.judge(step, config, horizon)
+    success, ended, terminated, truncated, too_much = flags
+    limited = config.max_contact_steps is not None
+    return Verdict(
+        success=success,
+        ended=ended,
+        terminated=terminated,
+        truncated=truncated,
+        steps=steps,
+        contact_steps=contact_steps if limited else step.contact_steps,
+        contact_failure=too_much if limited else None,
+        numbers=dict(zip(NUMBERS, columns, strict=True)),
+    )
 
 
 # in the kernel's order
@@ -95,9 +112,14 @@ def judge_dense(step: Step, config: TaskConfig, horizon: int) -> Verdict:
     distance = (tip - step.target).norm(dim=-1)
     success = (distance < config.success_radius) & ~step.broken
     steps = step.steps + active
-    terminated = step.terminated | (active & (success | step.broken))
-    truncated = step.truncated | (active & (steps >= horizon) & ~terminated)
     touching = step.touching.sum(dim=-1)
+    contact_steps, too_much, ends = step.contact_steps, None, step.broken
+    if config.max_contact_steps is not None:
+        contact_steps = contact_steps + (active & (touching > 0))
+        too_much = active & (contact_steps > config.max_contact_steps)
+        success, ends = success & ~too_much, ends | too_much
+    terminated = step.terminated | (active & (success | ends))
+    truncated = step.truncated | (active & (steps >= horizon) & ~terminated)
     terms = reward_terms(
         config.reward,
         distance=distance,
@@ -107,6 +129,7 @@ def judge_dense(step: Step, config: TaskConfig, horizon: int) -> Verdict:
         contact_nodes=touching,
         new_bins=step.new_bins,
         success=success,
+        contact_failure=too_much,
     )
     torque = config.actuation.max_torque * step.action
     numbers = (
@@ -124,5 +147,7 @@ def judge_dense(step: Step, config: TaskConfig, horizon: int) -> Verdict:
         terminated=terminated,
         truncated=truncated,
         steps=steps,
+        contact_steps=contact_steps,
+        contact_failure=too_much,
         numbers=dict(zip(NUMBERS, numbers, strict=True)),
     )

@@ -19,6 +19,7 @@ from softgm_bench.rod import sync
 
 DISCOUNT = 0.99  # of the returns that are reported, whatever an algorithm trains with
 FORGOTTEN = 0.1  # share of what came before that a recent mean forgets in a step
+CERTIFIED = "certified"  # the column of episodes whose scene is known to be solvable; see ``episodes.certified``
 CHECK_EVERY = 16  # steps between two checks whether an episode goes on, on a device that a check waits for
 
 Values = NDArray[np.float64] | NDArray[np.int64] | NDArray[np.bool_]
@@ -27,7 +28,8 @@ Values = NDArray[np.float64] | NDArray[np.int64] | NDArray[np.bool_]
 class EpisodeRecords(Mapping[str, Values]):
     """One number per episode in every column, ``(episodes,)``; columns are those of ``entries.EPISODE_COLUMNS``.
 
-    A column is absent where the task does not tell it. Bool columns say whether something ever happened in the episode.
+    A column is absent where the task does not tell it; ``certified`` is there where scenes are known. Bool columns say
+    whether something ever happened in the episode.
 
     Attributes:
         horizon: most control steps of an episode; None if the environment does not say it.
@@ -36,7 +38,7 @@ class EpisodeRecords(Mapping[str, Values]):
     def __init__(self, columns: Mapping[str, Values], horizon: int | None = None) -> None:
         """Hold columns of equal lengths, in the order of the table of entries."""
         self.horizon = horizon
-        known = [column.name for column in entries.EPISODE_COLUMNS]
+        known = [*(column.name for column in entries.EPISODE_COLUMNS), CERTIFIED]
         self._columns = {name: columns[name] for name in known if name in columns}
 
     def __getitem__(self, name: str) -> Values:
@@ -50,6 +52,11 @@ class EpisodeRecords(Mapping[str, Values]):
     def __len__(self) -> int:
         """Give the number of columns."""
         return len(self._columns)
+
+    def marked(self, certified: NDArray[np.bool_] | None) -> "EpisodeRecords":
+        """Add the column of certified scenes, ``(episodes,)``; None: there is none to add."""
+        more = {} if certified is None else {CERTIFIED: certified}
+        return EpisodeRecords(self._columns | more, self.horizon)
 
     @property
     def episodes(self) -> int:

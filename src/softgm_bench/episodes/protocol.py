@@ -87,10 +87,11 @@ class Protocol:
     def play(self, trained: TrainedPolicy, watch: Watch | None = None) -> EpisodeRecords:
         """Play the episodes in the environment that belongs to the policy; ``watch`` follows."""
         from softgm_bench.assembly import build_env
+        from softgm_bench.episodes import certified
         from softgm_bench.episodes.evaluation import evaluate_in_parts
         from softgm_bench.episodes.interventions import INTERVENTIONS
 
-        return evaluate_in_parts(
+        records = evaluate_in_parts(
             trained.policy,
             lambda count, seed: build_env(trained.config, count, seed, self.horizon),
             self.episodes,
@@ -101,6 +102,8 @@ class Protocol:
             show=INTERVENTIONS[self.intervention],
             watch=watch,
         )
+        known = certified.mask(trained.config, self.episodes, self.seed, self.batch, self.horizon)
+        return records.marked(known)
 
     def describe(self, trained: TrainedPolicy, overrides: Sequence[str]) -> dict[str, Any]:
         """Give the settings as ``summary.json`` has them, with ``overrides`` on top of the policy's own."""

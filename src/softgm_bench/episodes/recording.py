@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -76,7 +76,8 @@ def record(
         "backend": backend,
         "versions": versions(),
     }
-    return recorder.trajectory(json.loads(json.dumps(plain(config))), info)  # lists for tuples, as a file has them
+    simulated = plain(config) | {"rod": asdict(env.backend.parameters)}  # a task may have a surface of its own
+    return recorder.trajectory(json.loads(json.dumps(simulated)), info)  # lists for tuples, as a file has them
 
 
 def record_or_load(

@@ -5,8 +5,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from softgm_bench.episodes.evaluation import EpisodeRecords
+from softgm_bench.episodes.evaluation import CERTIFIED, EpisodeRecords
 
 STEPS = (50, 100, 200, 400, 2000)  # control steps by which successes are counted, where episodes are as long
 MOTIONLESS = 1e-4  # m a control step; a tip that moves less at the end of a failed episode stands still
@@ -17,6 +18,7 @@ def summarise(records: EpisodeRecords) -> dict[str, Any]:
     """Compute mean and standard deviation (over the episodes, population) of every column.
 
     Of what happened or did not there is the success rate with its 95 % interval, and otherwise the number of episodes.
+    ``success_certified`` is the rate on the scenes that are known to be solvable, with their number of episodes.
     ``success_by_step`` is the share of episodes that have succeeded by each of ``STEPS``, as far as the horizon goes.
     ``motionless_failures`` are the episodes that did not succeed and at whose end the tip moved by less than
     ``MOTIONLESS`` a step.
@@ -25,9 +27,9 @@ def summarise(records: EpisodeRecords) -> dict[str, Any]:
     numbers: dict[str, Any] = {}
     for name, values in records.items():
         if name == "success":
-            successes = int(values.sum())
-            low, high = wilson_interval(successes, records.episodes)
-            metrics["success_rate"] = {"mean": successes / records.episodes, "low": low, "high": high}
+            metrics["success_rate"] = _rate(values)
+        elif name == CERTIFIED:
+            metrics["success_certified"] = _rate(records["success"][values]) | {"episodes": int(values.sum())}
         elif values.dtype == np.bool_:
             metrics[name] = int(values.sum())
         else:
@@ -38,6 +40,14 @@ def summarise(records: EpisodeRecords) -> dict[str, Any]:
     if "success" in records and (by_step := success_by_step(records, records.horizon)):
         metrics["success_by_step"] = by_step
     return metrics | numbers
+
+
+def _rate(success: NDArray[Any]) -> dict[str, float]:
+    successes, episodes = int(success.sum()), len(success)
+    if not episodes:
+        return {"mean": math.nan, "low": 0.0, "high": 1.0}
+    low, high = wilson_interval(successes, episodes)
+    return {"mean": successes / episodes, "low": low, "high": high}
 
 
 def success_by_step(episodes: Mapping[str, Any], horizon: int | None) -> dict[str, float]:
@@ -65,6 +75,9 @@ def table(metrics: Mapping[str, Any], title: str) -> str:
     rows = []
     if (success := metrics.get("success_rate")) is not None:
         rows.append(("success rate", f"{success['mean']:.3f}  [{success['low']:.3f}, {success['high']:.3f}]"))
+    if (known := metrics.get("success_certified")) is not None:
+        of = f"of {known['episodes']} certified scenes"
+        rows.append(("success, certified", f"{known['mean']:.3f}  [{known['low']:.3f}, {known['high']:.3f}]  {of}"))
     rows += [(f"success by step {step}", f"{share:.3f}") for step, share in metrics.get("success_by_step", {}).items()]
     rows += [
         (name.replace("_", " "), f"{value['mean']:.3f} +- {value['std']:.3f}")

@@ -33,6 +33,7 @@ class RewardConfig:
     lambda_s: float
     epsilon: float
     lambda_succ: float
+    lambda_fail: float
 
 
 @dataclass
@@ -88,6 +89,9 @@ class TaskConfig:
     slots: int
     train_horizon: int | None
     hidden_scene: bool
+    max_contact_steps: int | None
+    friction_coefficient: float | None
+    velocity_damping_coefficient: float | None
     actuation: ActuationConfig
     reward: RewardConfig
     curriculum: CurriculumConfig
@@ -103,6 +107,12 @@ class TaskConfig:
                 raise ValueError(f"task.{name} is {getattr(self, name)}: it must be at least {lowest}")
         if self.train_horizon is not None and self.train_horizon < 1:
             raise ValueError(f"task.train_horizon is {self.train_horizon}: it must be at least 1, or null")
+        if self.max_contact_steps is not None and self.max_contact_steps < 0:
+            raise ValueError(f"task.max_contact_steps is {self.max_contact_steps}: it must be at least 0, or null")
+        for name in ("friction_coefficient", "velocity_damping_coefficient"):
+            value = getattr(self, name)
+            if value is not None and not value >= 0.0:
+                raise ValueError(f"task.{name} is {value}: it must not be negative; null: the rod's")
         for name in ("success_radius", "sensing_radius", "bin_length"):
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"task.{name} is {getattr(self, name)}: it must be above 0")

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -16,6 +17,7 @@ from softgm_bench.envs.tasks.base import (
     redraw_until,
     uniform_box,
 )
+from softgm_bench.envs.tasks.columns import columns
 from softgm_bench.envs.tasks.registry import register_task
 from softgm_bench.rod.state import Cylinders
 
@@ -58,7 +60,7 @@ class Wall(Task):
     A scene's ``privileged``: the opening's centre and side, m.
     """
 
-    config_class = WallConfig
+    config_class: ClassVar[type[WallConfig]] = WallConfig
     n_privileged = 4
     n_points = 1
 
@@ -71,10 +73,10 @@ class Wall(Task):
         """
         super().__init__(config)
         widest = config.opening_side
-        _check_opening(config, "task.opening_side", widest)
+        check_opening(config, "task.opening_side", widest)
         if config.curriculum.enabled:
             widest = config.curriculum.easy_opening_side
-            _check_opening(config, "task.curriculum.easy_opening_side", widest)
+            check_opening(config, "task.curriculum.easy_opening_side", widest)
             if widest < config.opening_side:
                 raise ValueError(
                     f"task.curriculum.easy_opening_side is {widest}: it must be at least task.opening_side, "
@@ -131,34 +133,19 @@ class Wall(Task):
         return ranges[0, 0], ranges[1:]
 
     def _columns(self, opening: Tensor, side: Tensor) -> Cylinders:
-        """Whole columns and the lower parts of cut ones, then the upper parts of these; existing ones first."""
-        c, device, count = self.config, opening.device, len(opening)
-        half = 0.5 * side
-        (low, high), column_y = c.wall_z, constant(self.column_y, device)
-        n, more = len(self.column_y), self.max_cylinders - len(self.column_y)
-        y, z = opening[:, 1:2], opening[:, 2:3]
-        cut = (column_y - y).abs() <= half + 1e-12  # (count, n)
-        lower_top = torch.where(cut, z - half, constant((high,), device))
-        upper_bottom = z + half
-        exists, order = cut.to(torch.int8).sort(dim=1, stable=True, descending=True)
-        exists, order = exists[:, :more].bool(), order[:, :more]
-        lower = constant(tuple((c.wall_x, y, low) for y in self.column_y), device).expand(count, n, 3)
-        xy = constant(tuple((c.wall_x, y) for y in self.column_y), device)[order]
-        upper = torch.cat([xy, upper_bottom.unsqueeze(-1).expand(count, more, 1)], dim=-1)
-        # a masked cylinder keeps a positive length so that nothing divides by zero
-        upper_length = torch.where(exists, high - upper_bottom, constant((1.0,), device))
-        start = torch.cat([lower, upper], dim=1)
-        return Cylinders(
-            start=start,
-            axis=constant((0.0, 0.0, 1.0), device).expand_as(start),
-            length=torch.cat([lower_top - low, upper_length], dim=1),
-            radius=constant((c.column_radius,), device).expand(count, n + more),
-            mask=torch.nn.functional.pad(exists, (n, 0), value=True),
-            batch_size=[count],
-        )
+        c, device = self.config, opening.device
+        along = constant(self.column_y, device)
+        feet = constant(tuple((c.wall_x, y, c.wall_z[0]) for y in self.column_y), device)
+        more = self.max_cylinders - len(self.column_y)
+        return columns(along, feet, [opening[:, 1:]], side, tuple(c.wall_z), c.column_radius, more)
 
 
-def _check_opening(config: WallConfig, name: str, side: float) -> None:
+def check_opening(config: WallConfig, name: str, side: float) -> None:
+    """Refuse an opening that does not fit between the wall's lower and upper edge.
+
+    Raises:
+        ValueError: with one line naming the key, its value and what would be right.
+    """
     half = 0.5 * side
     if config.opening_z[0] - half <= config.wall_z[0] or config.opening_z[1] + half >= config.wall_z[1]:
         raise ValueError(

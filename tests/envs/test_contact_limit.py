@@ -1,0 +1,115 @@
+"""A task may end an episode as failed after too many control steps of contact, and have a surface of its own."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from softgm_bench.envs import entries, make_env
+from softgm_bench.envs.verdict import judge_dense
+from softgm_bench.episodes.evaluation import evaluate
+from softgm_bench.episodes.summary import summarise
+from softgm_bench.rod.parameters import RodParameters
+
+ROD = RodParameters(substeps=50)
+PRESS = torch.tensor([1.0, 0.4])  # to the wall and along it, so that the tip does not rest between two columns
+
+
+def pressing(env, steps):
+    """Frames of arms that bend towards the wall and lean on it."""
+    action = PRESS.expand(env.batch_size[0], 6, 2)
+    td, frames = env.reset(), []
+    for _ in range(steps):
+        td = env.step(td.set(entries.ACTION, action))["next"]
+        frames.append(td.clone())
+    return frames
+
+
+@pytest.fixture
+def limited(settings):
+    def build(limit, num_envs=3, **options):
+        config = dataclasses.replace(settings("task=wall_touch").task, max_contact_steps=limit, wall_x=0.25)
+        return make_env(config, ROD, num_envs, seed=0, **options)
+
+    return build
+
+
+def test_one_step_of_contact_too_many_ends_an_episode_as_failed(limited):
+    env = limited(4)
+    frames = pressing(env, 60)
+    touched = torch.stack([frame[entries.CONTACT_NODES].squeeze(-1) > 0.0 for frame in frames])
+    failed = torch.stack([frame[entries.CONTACT_FAILURE].squeeze(-1) for frame in frames])
+    terminated = torch.stack([frame[entries.TERMINATED].squeeze(-1) for frame in frames])
+    for row in range(3):
+        fifth = int((touched[:, row].cumsum(0) == 5).nonzero()[0])
+        assert failed[:, row].nonzero().flatten().tolist() == [fifth]
+        assert not terminated[:fifth, row].any()
+        assert terminated[fifth:, row].all()
+        assert frames[fifth][entries.REWARD_TERMS, "collision"][row] < -env.task.config.reward.lambda_fail + 1e-3
+        assert frames[fifth - 1][entries.REWARD_TERMS, "collision"][row] > -1.0
+
+
+def test_the_count_begins_anew_with_an_episode(limited):
+    env = limited(4)
+    frames = pressing(env, 60)
+    assert (env.simulator.state.episodes.contact_steps == 5).all()
+    mask = torch.tensor([True, False, False])
+    env.reset(frames[-1].clone().set("_reset", mask.unsqueeze(-1)))
+    assert env.simulator.state.episodes.contact_steps.tolist() == [0, 5, 5]
+
+
+def test_contact_that_ends_an_episode_is_no_success_even_at_the_target(settings):
+    from envs_steps import one_step
+
+    config = dataclasses.replace(settings("task=wall_touch").task, max_contact_steps=2)
+    for contact_steps, touching, success in ((1, True, True), (2, False, True), (2, True, False)):
+        verdict = judge_dense(one_step(contact_steps=contact_steps, touching=touching), config, 100)
+        assert verdict.success.item() is success
+        assert verdict.terminated.item()
+        assert verdict.contact_failure.item() is not success
+
+
+def test_an_evaluation_tells_where_failures_end(limited):
+    env = limited(0, horizon=60)
+
+    def press(td):
+        return td.set(entries.ACTION, PRESS.expand(*td.batch_size, 6, 2).clone())
+
+    records = evaluate(press, env, deterministic=True, seed=0)
+    assert records["contact_failure"].all()
+    assert not records["success"].any()
+    assert (records["contact_steps"] == 1).all()
+    assert summarise(records)["contact_failure"] == 3
+
+
+@pytest.mark.parametrize("task", ["basic", "wall"])
+def test_without_a_limit_nothing_is_counted_or_told(settings, task):
+    env = make_env(settings(f"task={task}").task, ROD, 2, seed=0)
+    frames = pressing(env, 40)
+    assert entries.CONTACT_FAILURE not in frames[-1].keys(include_nested=True)
+    assert not env.simulator.state.episodes.contact_steps.any()
+
+
+def test_a_state_of_before_there_was_a_count_is_taken_over(limited):
+    env = limited(4)
+    pressing(env, 3)
+    state = env.simulation_state()
+    del state["episodes", "contact_steps"]
+    other = limited(4)
+    other.load_simulation_state(state)
+    assert torch.equal(other.rod.position, env.rod.position)
+    assert not other.simulator.state.episodes.contact_steps.any()
+
+
+def test_a_tasks_surface_takes_the_place_of_the_rods(settings):
+    config = settings("task=wall_search").task
+    smooth = dataclasses.replace(config, friction_coefficient=0.0)
+    rough, without, rods = (
+        make_env(task, dataclasses.replace(ROD, friction_coefficient=0.1), 2, seed=0)
+        for task in (config, smooth, dataclasses.replace(config, friction_coefficient=None))
+    )
+    assert rough.backend.parameters.friction_coefficient == 0.5
+    assert without.backend.parameters.friction_coefficient == 0.0
+    assert rods.backend.parameters.friction_coefficient == 0.1
+    one, other = (pressing(env, 40)[-1] for env in (rough, without))
+    assert not torch.allclose(one[entries.TIP], other[entries.TIP], atol=1e-4)
