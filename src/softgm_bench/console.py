@@ -18,6 +18,7 @@ COMMANDS = {
     "replay": "a recorded episode again, in this simulator or in PyElastica",
     "report": "tables and figures of many runs",
     "status": "what has become of the runs in a folder",
+    "certify": "which scenes of a task can be solved: actions that do",
     "export": "the policy of a run as one small file",
 }
 VERSION = f"softgm-bench {__version__}"
