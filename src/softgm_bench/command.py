@@ -13,7 +13,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from softgm_bench import output, process
-from softgm_bench.config import CHANGEABLE
+from softgm_bench.config import CHANGEABLE, config_directory
 from softgm_bench.config.explain import USER_ERRORS, explain
 from softgm_bench.config.numbers import check_finite
 from softgm_bench.errors import UserError
@@ -43,6 +43,7 @@ def _run(name: str, text: str | None, body: Callable[[list[str]], None], argumen
         print((text or "").strip().replace("``", ""))
         return 0
     try:
+        config_directory()  # refuses a package that was not unpacked
         body(arguments)
     except USER_ERRORS as error:
         if os.environ.get("HYDRA_FULL_ERROR") == "1":
