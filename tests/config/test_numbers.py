@@ -87,7 +87,7 @@ def test_what_the_arm_cannot_reach_is_refused_with_what_would_do():
     fine = ("rod.dt=2e-4", "rod.substeps=200")
     assert "the arm reaches 0.65 m" in refusal("rod.base_length=0.6", *fine)
     assert "target_x" in refusal("task=wall", "rod.base_length=0.6", *fine)
-    assert refusal("task=wall", "rod.base_length=0.9").startswith("task.max_path=0.92 with rod.base_length=0.9: ")
+    assert refusal("task=wall", "rod.base_length=0.85").startswith("task.max_path=0.92 with rod.base_length=0.85: ")
     assert "1.9" in refusal("task.curriculum.enabled=true", "task.curriculum.easy_target_distance=[1.5,1.9]")
 
 

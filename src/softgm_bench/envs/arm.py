@@ -90,10 +90,10 @@ def _check(settings: Settings) -> None:
             f"task.resting_tip={list(tip)} with rod.base_length={rod.base_length}: "
             f"the arm's tip rests at {[0.0, 0.0, rod.base_length]}"
         )
-    if rod.base_length < (way := getattr(config, "max_path", 0.0)) < math.inf:
+    if reach < (way := getattr(config, "max_path", 0.0)) < math.inf:
         raise ValueError(
-            f"task.max_path={way} with rod.base_length={rod.base_length}: no longer way can be gone by this arm; "
-            f"give task.max_path={0.92 * rod.base_length:.3g}"
+            f"task.max_path={way} with rod.base_length={rod.base_length}: the arm's way to a target is at most "
+            f"{reach:.2f} m; give task.max_path={0.92 * rod.base_length:.3g}"
         )
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from softgm_bench.rod.parameters import RodParameters
 
-# Share of the limit that settings may use. Under random torques on a dozen arms (moduli, density, length, radius and
+# Share of the limit that settings may use. Under random torques on eight arms (moduli, density, length, radius and
 # damping over a factor of ten), all at 1.05 were torn apart within three control steps; at 0.95 none was within seven.
 MARGIN = 0.95
 POINTS = 512  # among which the limit is looked for: a quarter of a per cent
