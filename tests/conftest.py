@@ -1,6 +1,8 @@
 """Shared fixtures: two cores at most, and task settings as the command line composes them."""
 
 import os
+import signal
+import threading
 
 import pytest
 import torch
@@ -15,8 +17,9 @@ torch.set_num_threads(1 if "PYTEST_XDIST_WORKER" in os.environ else 2)
 # a command's standard error does not depend on how busy the machine is, nor on what is compiled already
 progress.SECONDS_BETWEEN_LINES = float("inf")
 compilation.told()
-
-TASKS = ("basic", "structured", "wall", "wall_narrow", "wall_fixed", "wall_touch", "wall_search", "wall_decoy")
+# whoever started the tests in the background has them ignore Ctrl-C, and so would every command that they start
+if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")

@@ -11,7 +11,7 @@ import pytest
 import yaml
 from omegaconf import OmegaConf
 
-from conftest import TASKS
+from every_task import TASKS
 from softgm_bench.config import compose_untyped
 
 ROOT = Path(__file__).parents[1]

@@ -1,4 +1,4 @@
-"""Find actions that succeed in a task's held-out scenes: ``python -m softgm_bench.certify task=NAME key=value ...``.
+"""Find actions that succeed in a task's held-out scenes: ``softgm-bench certify task=NAME key=value ...``.
 
 The scenes are those of ``evaluate episodes=EPISODES seed=SEED``. What is found is written after every round, and a
 search goes on from what ``out`` holds. Settings, with their defaults:

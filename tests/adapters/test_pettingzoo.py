@@ -299,7 +299,7 @@ def test_steps_that_cannot_be_are_refused():
         env.reset(seed=-1)
     env.step(actions)
     with pytest.raises(ValueError, match=r"reset\(\)"):
-        env.step({})
+        env.step(actions)
 
 
 def test_copies_of_an_unseeded_environment_play_scenes_of_their_own():

@@ -46,5 +46,8 @@ def test_a_run_from_before_there_were_named_recipes_is_the_same_run():
 
 
 def test_what_came_later_is_free_unless_it_changes_numbers():
-    networks = {f"algo.{part}.embedding_norm" for part in ("actor", "critic")} | {"algo.actor.relative_points"}
-    assert set(NEUTRAL) - set(FREE) == networks | {"algo.actor.memory", "model.remember", "matmul"}
+    networks = {f"algo.{part}.embedding_norm" for part in ("actor", "critic")}
+    networks |= {"algo.actor.relative_points", "algo.actor.memory", "model.remember", "matmul"}
+    surfaces = {f"task.{name}_coefficient" for name in ("friction", "velocity_damping")}
+    tasks = surfaces | {"task.max_contact_steps", "task.reward.lambda_fail"}
+    assert set(NEUTRAL) - set(FREE) == networks | tasks

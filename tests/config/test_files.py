@@ -3,7 +3,7 @@
 import pytest
 from omegaconf import DictConfig, OmegaConf
 
-from conftest import TASKS
+from every_task import TASKS
 from softgm_bench.algorithms import algorithm_configs
 from softgm_bench.assembly import configure
 from softgm_bench.config import compose, config_directory, plain

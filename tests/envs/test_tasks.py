@@ -4,8 +4,8 @@ import math
 import pytest
 import torch
 
-from conftest import TASKS
 from dense import force_dense
+from every_task import TASKS
 from softgm_bench.envs.tasks import make_task
 from softgm_bench.envs.tasks.base import first_accepted
 
