@@ -14,6 +14,8 @@ SCENES = (
     ("wall_softgm", ("wall_attention.png",), ("seed=3", "attention=true", "step=30", "distance=1.9")),
     ("wall_softgm", ("wall_narrow.png",), ("task=wall_narrow", "seed=4")),
     ("wall_softgm", ("wall_fixed.png",), ("task=wall_fixed", "seed=8")),
+    ("wall_softgm", ("wall_search.png",), ("task=wall_search", "seed=3")),
+    ("wall_softgm", ("wall_decoy.png",), ("task=wall_decoy", "seed=6")),
     ("wall_softgm", ("wall.mp4", "wall.html"), ("seed=3",)),
     ("wall_softgm", ("wall.webp",), ("seed=3", "width=480", "height=360", "fps=20")),
 )
