@@ -61,7 +61,7 @@ PUBLIC = {
         "episodes.replay",
     ],
     "render": ["render.still", "render.video", "render.html"],
-    "adapters": ["adapters.pettingzoo", "adapters.gymnasium_vector"],
+    "adapters": ["adapters.pettingzoo", "adapters.player", "adapters.gymnasium_vector"],
 }
 
 
