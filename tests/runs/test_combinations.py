@@ -8,6 +8,7 @@ import pytest
 import torch
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+import every_task
 from pairwise import pairwise
 from softgm_bench.algorithms import algorithm_configs, build_algorithm
 from softgm_bench.config import compose
@@ -17,7 +18,8 @@ from softgm_bench.runs import checkpoint
 from softgm_bench.runs.loop import train
 from softgm_bench.storage.run_folder import RunFolder
 
-TASKS = ("basic", "structured", "wall", "wall_narrow", "wall_fixed")
+FELT = ("wall_touch", "wall_search", "wall_decoy")  # walls that have to be felt
+TASKS = tuple(task for task in every_task.TASKS if task not in FELT)
 ALGORITHMS = tuple(algorithm_configs())
 ON_POLICY = ("softgm", "ippo", "mappo")
 ABLATIONS = ("softgm_no_stage1", "softgm_no_stage2", "softgm_remember")  # models of SoftGM's algorithm
@@ -71,6 +73,12 @@ def check_run(folder, algo, *overrides):
 def test_every_algorithm_trains_with_every_model_on_every_task(tmp_path, algo, model, task):
     summary = check_run(tmp_path, algo, f"task={task}", f"model={model}")
     assert (summary["model"], summary["algo"]) == (model, algo if model == OWN[algo] else f"{algo}_{model}")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("algo", "task"), product(("softgm", "ippo", "masac", "iddpg"), FELT))
+def test_algorithms_of_every_kind_train_on_walls_that_have_to_be_felt(tmp_path, algo, task):
+    assert check_run(tmp_path, algo, f"task={task}", f"model={OWN[algo]}")["task"] == task
 
 
 @pytest.mark.parametrize(
