@@ -84,6 +84,7 @@ class SoftArmEnv(RememberingEnv):
         if not stagger:
             self.simulator.seed(seed)  # a seed means the same scenes here as in ``set_seed``
         curriculum, perturbed = self.simulator.curriculum, self.simulator.perturbation is not None
+        self._never = torch.zeros(num_envs, dtype=torch.bool, device=self.device)  # a step begins no episode
         self._limited = task.config.max_contact_steps is not None
         specs = make_specs(
             num_envs,
@@ -164,9 +165,8 @@ class SoftArmEnv(RememberingEnv):
         episodes = self.simulator.state.episodes
         outcome = self.simulator.step(tensordict.get(entries.ACTION).clamp(-1.0, 1.0))
         verdict = outcome.verdict
-        begins = torch.zeros_like(outcome.broken)
         endings = (verdict.success, outcome.broken, verdict.contact_failure)
-        return self._frame(episodes, outcome.sight, verdict.numbers, *endings, begins)
+        return self._frame(episodes, outcome.sight, verdict.numbers, *endings, self._never)
 
     # frames
 
