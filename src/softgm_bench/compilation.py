@@ -27,7 +27,7 @@ class _Compilations(event.Listener):
             self._began = time.perf_counter()
             if not self.told:
                 self.told = True
-                _say(LINE)
+                say(LINE)
         self._depth += 1
 
     def on_end(self, event: event.Event) -> None:
@@ -56,7 +56,8 @@ def seconds() -> float:
     return _LISTENER.seconds
 
 
-def _say(line: str) -> None:
+def say(line: str) -> None:
+    """Print a line about compiling to standard error, where somebody reads it."""
     if sys.stderr is not None:
         with suppress(OSError, ValueError):  # nobody reads it any more
             print(f"softgm_bench: {line}", file=sys.stderr, flush=True)

@@ -4,6 +4,7 @@ A task may have a file of them, ``episodes/certified/<task>.npz``; ``softgm_benc
 that plays scenes of the file counts its success on the certified ones by themselves: there, 1 is within reach.
 """
 
+import io
 import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -20,6 +21,7 @@ from softgm_bench.config import Config
 from softgm_bench.envs import SoftArmEnv, entries
 from softgm_bench.episodes.evaluation import evaluation_seed
 from softgm_bench.errors import UserError
+from softgm_bench.storage.files import write_where_asked
 
 FOLDER = Path(__file__).with_suffix("")
 LEVELS = 127  # of an action's component on either side of 0: sequences are stored in one byte a number
@@ -100,15 +102,17 @@ def first_frame(config: Config, episodes: int, seed: int) -> SoftArmEnv:
 
 
 def save(certified: Certified, path: Path) -> None:
-    """Write a file of scenes, compressed."""
+    """Write a file of scenes, compressed.
+
+    Raises:
+        UserError: it cannot be written.
+    """
     about = {"task": certified.task, "seed": certified.seed, "physics": certified.physics}
     arrays = {name: getattr(certified, name) for name in ("target", "privileged", "action")}
     arrays |= {"length": certified.length.astype(np.int16), "tried": certified.tried.astype(np.int32)}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(path.name + ".part")
-    with part.open("wb") as file:
-        np.savez_compressed(file, about=np.array(json.dumps(about)), **arrays)
-    part.replace(path)
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, about=np.array(json.dumps(about)), **arrays)
+    write_where_asked(path, buffer.getvalue())
 
 
 def load(path: Path) -> Certified:

@@ -1,6 +1,5 @@
 """Numba's compiler, with machine code kept on disk wherever there is a place for it."""
 
-import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -36,8 +35,7 @@ def _tell() -> None:
     global _told
     if not _told:
         _told = True
-        print(
-            "softgm_bench: compiled code cannot be kept, every process compiles anew: "
-            "set NUMBA_CACHE_DIR to a folder that can be written",
-            file=sys.stderr,
+        compilation.say(
+            "compiled code cannot be kept, every process compiles anew: "
+            "set NUMBA_CACHE_DIR to a folder that can be written"
         )
