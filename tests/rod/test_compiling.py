@@ -15,10 +15,10 @@ CODE = "from softgm_bench.rod import compiling\n@compiling.njit()\ndef f(x):\n  
 def test_without_a_place_for_a_cache_code_compiles_and_says_what_would_help(monkeypatch, capsys):
     usual = compiling.numba.njit
 
-    def nowhere(**options):
+    def nowhere(*function, **options):
         if options.pop("cache", False):
             raise RuntimeError("cannot cache function 'f': no locator available for file 'f.py'")
-        return usual(**options)
+        return usual(*function, **options)
 
     monkeypatch.setattr(compiling.numba, "njit", nowhere)
     monkeypatch.setattr(compiling, "_told", False)
