@@ -70,9 +70,8 @@ def test_a_step_can_be_taken_where_tensors_have_no_values_and_no_cpu_tensor_join
     expected = leaves(env._step(td))
     vars(env)["_device"] = torch.device("meta")  # env.to() would look at the bounds in the specs
     vars(env.simulator)["device"] = torch.device("meta")
-    for name, value in vars(env.simulator).items():
-        if isinstance(value, torch.Tensor):
-            setattr(env.simulator, name, value.to("meta"))
+    for owner in (vars(env), vars(env.simulator)):
+        owner.update({name: value.to("meta") for name, value in owner.items() if isinstance(value, torch.Tensor)})
     env.simulator.state = env.simulator.state.to("meta")
     env.simulator._actuation.matrix = env.simulator._actuation.matrix.to("meta")
     found = leaves(env._step(td.to("meta")))
