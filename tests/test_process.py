@@ -1,6 +1,7 @@
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 from softgm_bench import process
 
@@ -58,6 +59,20 @@ def test_products_stay_float32_whatever_came_before():
     use_onednn += "; torch.backends.mkldnn.matmul.fp32_precision = 'none'"
     for before in ("", use_onednn):
         assert python(code.format(before=before)) == "True"
+
+
+def test_products_are_rounded_where_that_is_asked_for_and_the_processor_can():
+    code = (
+        "import torch\nfrom softgm_bench.errors import UserError\nfrom softgm_bench.runs.machine import set_threads\n"
+        "try: set_threads(1, 'bf16')\nexcept UserError as error: print(error)\n"
+        "x = torch.full((64, 64), 1.0 + 2.0**-12); print(torch.equal(x @ torch.eye(64), x))\n"
+        "set_threads(1); print(torch.equal(x @ torch.eye(64), x))"
+    )
+    refused = "matmul=bf16: this processor has no instructions for it; choose float32, or null\nTrue\nTrue"
+    about = Path("/proc/cpuinfo")
+    able = about.exists() and {"avx512_bf16", "amx_bf16"} & set(about.read_text().split())
+    assert python(code, ONEDNN_MAX_CPU_ISA="AVX2") == refused
+    assert python(code) == ("False\nTrue" if able else refused)
 
 
 def test_asking_for_the_python_interface_prepares_the_process_before_torch_is_loaded():

@@ -25,6 +25,13 @@ def prepare() -> None:
             os.environ.setdefault(name, value)
 
 
+def allow_bf16() -> None:
+    """Let oneDNN round to bfloat16, which ``prepare`` has forbidden; what the user has set stays."""
+    name = "ONEDNN_MAX_CPU_ISA"
+    if os.environ.get(name) == SETTINGS[name]:
+        del os.environ[name]
+
+
 def quieten() -> None:
     """Keep warnings of libraries from users of a command, who can do nothing about them.
 

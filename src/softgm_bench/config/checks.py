@@ -3,7 +3,7 @@
 import os
 import re
 
-from softgm_bench.config.schema import COMPILES, DTYPES, GRAPHS, MATMULS, OBSERVATIONS, Config
+from softgm_bench.config.schema import BF16, COMPILES, DTYPES, GRAPHS, MATMULS, OBSERVATIONS, TF32, Config
 from softgm_bench.errors import UserError
 from softgm_bench.rod.backend import BACKENDS, check_backend
 
@@ -62,6 +62,8 @@ def _validate_machine(config: Config) -> None:
     if config.matmul is not None and config.matmul not in MATMULS:
         raise UserError(f"matmul={config.matmul}: choose one of {', '.join(MATMULS)}, or null")
     kind = device_type(config.device)
+    if config.matmul == (BF16 if kind == "cuda" else TF32):
+        raise UserError(f"matmul={config.matmul} with device={config.device}: tf32 is for device=cuda, bf16 for a CPU")
     if config.compile == GRAPHS and kind == "cpu":
         raise UserError(
             f"compile={GRAPHS} with device={config.device}: CUDA graphs need device=cuda; choose none or null"

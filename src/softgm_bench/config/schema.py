@@ -10,8 +10,8 @@ from softgm_bench.rod.parameters import RodParameters
 DTYPES = ("float64", "float32")
 NO_GRAPHS, GRAPHS = "none", "graph"
 COMPILES = (NO_GRAPHS, GRAPHS)
-TF32, FLOAT32 = "tf32", "float32"
-MATMULS = (TF32, FLOAT32)
+TF32, BF16, FLOAT32 = "tf32", "bf16", "float32"
+MATMULS = (TF32, BF16, FLOAT32)
 OBSERVATIONS = ("standard", "oracle")
 TUNED, PAPER = "tuned", "paper"
 RECIPES = (TUNED, PAPER)

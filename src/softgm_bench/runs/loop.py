@@ -99,7 +99,7 @@ def _build(config: Config) -> Run:
     """A run at its beginning; nothing is written yet."""
     started, budget = time.perf_counter(), Budget(config.experiment.minutes)
     seeds = derive_seeds(config.seed)
-    set_threads(config.threads)
+    set_threads(config.threads, config.matmul)
     if config.device != "cpu":
         set_matmul(config.matmul)
     keep_memory()

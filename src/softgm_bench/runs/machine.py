@@ -8,25 +8,36 @@ import torch
 
 from softgm_bench import process
 from softgm_bench.config import available_threads
-from softgm_bench.config.schema import FLOAT32
+from softgm_bench.config.schema import BF16, FLOAT32
+from softgm_bench.errors import UserError
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # glibc's malloc.h
 
 
-def set_threads(threads: int | None) -> int:
+def set_threads(threads: int | None, matmul: str | None = None) -> int:
     """Let torch and Numba use this many threads, or all there are; returns how many.
 
-    Matrix products on the CPU go to oneDNN, twice as fast as MKL on AMD's cores, as long as they stay float32.
+    Matrix products on the CPU go to oneDNN, twice as fast as MKL on AMD's cores, and stay float32, unless ``matmul`` is
+    ``bf16``: then their factors are rounded to bfloat16, and their sums are float32.
+
+    Raises:
+        UserError: ``bf16``, and this processor has no instructions for it.
     """
     process.prepare()
+    if matmul == BF16:
+        process.allow_bf16()
     count = threads or available_threads()
     # Numba first: when it starts its threads, it sets OpenMP's number of them, which is torch's too
     numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))
     torch.set_num_threads(count)
-    matmul = torch.backends.mkldnn.matmul  # type: ignore[attr-defined]
-    usual, matmul.fp32_precision = matmul.fp32_precision, "bf16"
-    if not _products_are_float32():  # a product came before ``process.prepare``, which then had no effect
-        matmul.fp32_precision = usual
+    products = torch.backends.mkldnn.matmul  # type: ignore[attr-defined]
+    products.fp32_precision = "bf16"
+    if matmul == BF16:
+        if _products_are_float32():
+            products.fp32_precision = "ieee"
+            raise UserError("matmul=bf16: this processor has no instructions for it; choose float32, or null")
+    elif not _products_are_float32():  # a product came before ``process.prepare``, which then had no effect
+        products.fp32_precision = "ieee"
     return count
 
 
