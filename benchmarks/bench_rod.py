@@ -19,7 +19,7 @@ from timing import best_rate, kernel_rate, sideways
 from softgm_bench.config import compose
 from softgm_bench.envs.tasks import make_task
 from softgm_bench.rod.parameters import RodParameters
-from softgm_bench.rod.pyelastica_oracle import Loads, Post, as_cylinders, build
+from softgm_bench.rod.pyelastica_oracle import Loads, Post, as_cylinders, build, posts_of
 
 ARM = RodParameters()
 BATCHES = (1, 16, 64, 256, 1024)
@@ -29,9 +29,8 @@ LEAN = 16.0  # N m per m towards the wall
 
 def task_posts(task: str) -> tuple[Post, ...]:
     """The obstacles of one episode."""
-    cylinders = make_task(compose([f"task={task}"]).task).sample(1, torch.Generator().manual_seed(0)).cylinders[0]
-    rows = zip(*(getattr(cylinders, name)[cylinders.mask].tolist() for name in Post._fields), strict=True)
-    return tuple(Post(tuple(start), tuple(axis), length, radius) for start, axis, length, radius in rows)
+    scene = make_task(compose([f"task={task}"]).task).sample(1, torch.Generator().manual_seed(0))
+    return posts_of(scene.cylinders, 0)
 
 
 def couple(leans: bool, num_envs: int, dtype: torch.dtype) -> torch.Tensor:

@@ -48,6 +48,7 @@ PUBLIC = {
         "rod.numba_backend",
         "rod.torch_backend",
         "rod.cuda_backend",
+        "rod.pyelastica_backend",
     ],
     "models": ["models", "models.registry", "models.graph", "models.softgm", "models.mlp", "models.heads"],
     "algorithms": ["algorithms", "algorithms.registry"],

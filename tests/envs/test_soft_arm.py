@@ -141,7 +141,7 @@ def test_a_partial_reset_changes_no_bit_of_the_others(build, task):
     assert not torch.equal(undisturbed[entries.AGENT_POSITION][1], disturbed[entries.AGENT_POSITION][1])
 
 
-@pytest.mark.parametrize("backend", ["numba", "torch"])
+@pytest.mark.parametrize("backend", ["numba", "torch", "pyelastica"])
 @pytest.mark.parametrize("broken", ["position", "omega", "velocity", "director"])
 def test_a_state_that_is_not_finite_ends_that_environment_and_changes_no_bit_of_the_others(build, backend, broken):
     actions = random_actions(build(), 4)

@@ -54,8 +54,16 @@ def test_a_diverged_episode_has_its_bits_too():
     assert one.diverged
     assert np.array_equal(one.position[-1], one.position[-2])
     assert compare(one, replay(one, "numba"))["identical"]
-    with pytest.raises(UserError, match="broke in its last step"):
-        replay(one, "pyelastica")
+    in_pyelastica = replay(one, "pyelastica")
+    assert np.array_equal(in_pyelastica.position[-1], in_pyelastica.position[-2])
+
+
+def test_an_episode_that_was_played_in_pyelastica_has_its_bits_there():
+    one = recorded(*WALL, "backend=pyelastica", "perturbation=disturbance", horizon=20)
+    assert one.info["backend"] == "pyelastica"
+    assert one.contact.any()
+    assert compare(one, replay(one, "pyelastica"))["identical"]
+    assert not compare(one, replay(one, "numba"))["identical"]
 
 
 def test_another_action_is_noticed():

@@ -43,7 +43,8 @@ def test_a_device_that_no_backend_is_made_for_has_no_default():
 
 
 @pytest.mark.parametrize(
-    ("name", "device_type"), [("numba", "cpu"), ("torch", "cpu"), ("torch", "cuda"), ("cuda", "cuda")]
+    ("name", "device_type"),
+    [("numba", "cpu"), ("torch", "cpu"), ("torch", "cuda"), ("cuda", "cuda"), ("pyelastica", "cpu")],
 )
 def test_a_backend_passes_on_its_devices(name: str, device_type: str):
     check_backend(name, device_type)
@@ -52,8 +53,17 @@ def test_a_backend_passes_on_its_devices(name: str, device_type: str):
 @pytest.mark.parametrize(
     ("name", "device_type", "line"),
     [
-        ("cuda", "cpu", "backend=cuda does not run on device=cpu: choose device=cuda, or backend=numba or torch"),
+        (
+            "cuda",
+            "cpu",
+            "backend=cuda does not run on device=cpu: choose device=cuda, or backend=numba or torch or pyelastica",
+        ),
         ("numba", "cuda", "backend=numba does not run on device=cuda: choose device=cpu, or backend=torch or cuda"),
+        (
+            "pyelastica",
+            "cuda",
+            "backend=pyelastica does not run on device=cuda: choose device=cpu, or backend=torch or cuda",
+        ),
         ("torch", "mps", "backend=torch does not run on device=mps: choose device=cpu or cuda"),
     ],
 )
@@ -64,7 +74,7 @@ def test_a_backend_is_refused_elsewhere_in_one_line_that_says_what_would_do(name
 
 @pytest.mark.parametrize("ask", [lambda: make_backend("jax", ARM), lambda: check_backend("jax", "cpu")])
 def test_an_unknown_name_is_refused_with_the_known_ones(ask):
-    with pytest.raises(ValueError, match=r"^backend is 'jax': choose one of numba, torch, cuda$"):
+    with pytest.raises(ValueError, match=r"^backend is 'jax': choose one of numba, torch, cuda, pyelastica$"):
         ask()
 
 

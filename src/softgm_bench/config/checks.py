@@ -70,7 +70,7 @@ def _validate_machine(config: Config) -> None:
         )
     if config.backend is not None:
         try:
-            check_backend(config.backend, kind)
+            check_backend(config.backend, kind, config.dtype)
         except ValueError as error:
             raise UserError(str(error)) from error
     validate_device(config.device)

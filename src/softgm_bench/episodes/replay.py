@@ -1,7 +1,7 @@
 """A recorded episode once more: its actions and forces, against its cylinders, by any implementation of the rod."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,9 +14,10 @@ from softgm_bench.rod import backend as rod_backend
 from softgm_bench.rod.actuation import Actuation
 from softgm_bench.rod.divergence import diverged
 from softgm_bench.rod.parameters import rod_constants
+from softgm_bench.rod.pyelastica_backend import PyElasticaBackend
 from softgm_bench.rod.state import Cylinders, RodState
 
-BACKENDS = (*(name for name in rod_backend.BACKENDS if rod_backend.runs_on(name, "cpu")), "pyelastica")
+BACKENDS = tuple(name for name in rod_backend.BACKENDS if rod_backend.runs_on(name, "cpu"))
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,9 @@ def replay(
         raise UserError(f"backend={backend}: choose one of {', '.join(BACKENDS)}")
     if pruning and backend != "pyelastica":
         raise UserError(f"pruning=true: only backend=pyelastica has bounding boxes, not backend={backend}")
-    return _pyelastica(trajectory, pruning, watch) if backend == "pyelastica" else _ours(trajectory, backend, watch)
+    if backend == "pyelastica":
+        return _by_pyelastica(trajectory, PyElasticaBackend(trajectory.rod, pruning), watch)
+    return _replayed(trajectory, rod_backend.make_backend(backend, trajectory.rod), watch)
 
 
 def compare(trajectory: Trajectory, replayed: Replay) -> dict[str, Any]:
@@ -87,21 +90,34 @@ def _outcome(position: Array, target: Array, radius: float) -> dict[str, Any]:
     return {"final_distance": float(distance[-1]), "reached": int(reached[0]) + 1 if len(reached) else None}
 
 
-def _ours(trajectory: Trajectory, name: str, watch: Callable[[], None] | None) -> Replay:
-    parameters, dtype = trajectory.rod, torch.from_numpy(trajectory.position).dtype
-    backend, couple, force = (
-        rod_backend.make_backend(name, parameters),
-        _couple(trajectory, dtype, watch),
-        _force(trajectory),
-    )
-    cylinders = _cylinders(trajectory, dtype)
+def _by_pyelastica(trajectory: Trajectory, backend: PyElasticaBackend, watch: Callable[[], None] | None) -> Replay:
+    forces: list[float] = []
+    states = _replayed(trajectory, backend, watch, torch.float64, lambda: forces.append(float(backend.contact_force)))
+    return replace(states, contact_force=np.array(forces), missed=backend.missed)
+
+
+def _replayed(
+    trajectory: Trajectory,
+    backend: rod_backend.Backend,
+    watch: Callable[[], None] | None,
+    dtype: torch.dtype | None = None,
+    note: Callable[[], None] | None = None,
+) -> Replay:
+    """Move the arm; in the recording's type unless ``dtype`` says another. ``note`` is called after each step."""
+    dtype = dtype or torch.from_numpy(trajectory.position).dtype
+    couple, force, cylinders = _couple(trajectory, dtype), _force(trajectory), _cylinders(trajectory, dtype)
     task = trajectory.config["task"]
-    rest_length = torch.as_tensor(rod_constants(parameters).rest_length, dtype=dtype)
-    state = RodState(**{name: _first(trajectory, name) for name in ROD}, batch_size=[1])
+    rest_length = torch.as_tensor(rod_constants(trajectory.rod).rest_length, dtype=dtype)
+    first = {name: torch.from_numpy(getattr(trajectory, name)[:1].copy()).to(dtype) for name in ROD}
+    state = RodState(**first, batch_size=[1])
     states = [state]
     for step in range(trajectory.steps):
+        if watch is not None:
+            watch()
         push = None if force is None else torch.from_numpy(force(step)).to(dtype).unsqueeze(0)
         moved = backend.control_step(state, couple(step), force=push, cylinders=cylinders)
+        if note is not None:
+            note()
         # the environment keeps the last state of an arm whose simulation breaks
         broken = diverged(moved, rest_length, task["min_dilatation"], task["max_dilatation"])
         state = state if bool(broken.any()) else moved
@@ -110,36 +126,8 @@ def _ours(trajectory: Trajectory, name: str, watch: Callable[[], None] | None) -
     return Replay(**arrays)
 
 
-def _pyelastica(trajectory: Trajectory, pruning: bool, watch: Callable[[], None] | None) -> Replay:
-    try:
-        from softgm_bench.rod.pyelastica_oracle import Post, simulate
-    except ImportError as error:
-        raise UserError("backend=pyelastica needs PyElastica: pip install '.[pyelastica]'") from error
-    parameters = trajectory.rod
-    if parameters.contact_model != "pyelastica" and len(trajectory.cylinders["start"]):
-        raise UserError(f"rod.contact_model={parameters.contact_model}: PyElastica has no such contact")
-    if trajectory.diverged:
-        raise UserError("backend=pyelastica: this episode's simulation broke in its last step, which has no state")
-    couple = _couple(trajectory, torch.float64, watch)
-    columns = (trajectory.cylinders[name].tolist() for name in Post._fields)
-    posts = [Post(*row) for row in zip(*columns, strict=True)]
-    history = simulate(
-        parameters, lambda step: couple(step)[0].numpy(), trajectory.steps, posts, _force(trajectory), pruning
-    )
-    states: dict[str, Any] = {
-        name: np.concatenate([getattr(trajectory, name)[:1].astype(np.float64), getattr(history, name)]) for name in ROD
-    }
-    return Replay(**states, contact_force=history.contact_force, missed=history.missed)
-
-
-def _first(trajectory: Trajectory, name: str) -> torch.Tensor:
-    return torch.from_numpy(getattr(trajectory, name)[:1].copy())
-
-
-def _couple(
-    trajectory: Trajectory, dtype: torch.dtype, watch: Callable[[], None] | None
-) -> Callable[[int], torch.Tensor]:
-    """Couple on the elements in a step, N m, ``(1, 3, n_elements)``; it is asked for once a step, which is watched."""
+def _couple(trajectory: Trajectory, dtype: torch.dtype) -> Callable[[int], torch.Tensor]:
+    """Couple on the elements in a step, N m, ``(1, 3, n_elements)``."""
     settings = trajectory.config["task"]["actuation"]
     actuation = Actuation(
         trajectory.rod,
@@ -149,13 +137,7 @@ def _couple(
         settings["scaling"],
         dtype=dtype,
     )
-
-    def couple(step: int) -> torch.Tensor:
-        if watch is not None:
-            watch()
-        return actuation.couple(torch.from_numpy(trajectory.action[step : step + 1]))
-
-    return couple
+    return lambda step: actuation.couple(torch.from_numpy(trajectory.action[step : step + 1]))
 
 
 def _force(trajectory: Trajectory) -> Callable[[int], NDArray[np.float64]] | None:

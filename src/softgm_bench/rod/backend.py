@@ -42,28 +42,36 @@ class _Registered(NamedTuple):
         factory: name of the class, which takes ``RodParameters``.
         device_types: torch's names of the device types on which it runs.
         default_on: those of them on which it is the one to take where nobody chose.
+        dtypes: of states that it can move.
     """
 
     module: str
     factory: str
     device_types: tuple[str, ...]
     default_on: tuple[str, ...] = ()
+    dtypes: tuple[str, ...] = ("float64", "float32")
 
 
 _REGISTRY = {
     "numba": _Registered("softgm_bench.rod.numba_backend", "NumbaBackend", ("cpu",), default_on=("cpu",)),
     "torch": _Registered("softgm_bench.rod.torch_backend", "TorchBackend", ("cpu", "cuda")),
     "cuda": _Registered("softgm_bench.rod.cuda_backend", "CudaBackend", ("cuda",), default_on=("cuda",)),
+    "pyelastica": _Registered(
+        "softgm_bench.rod.pyelastica_backend", "PyElasticaBackend", ("cpu",), dtypes=("float64",)
+    ),
 }
 
 BACKENDS = tuple(_REGISTRY)
 
 
 def make_backend(name: str, parameters: RodParameters) -> Backend:
-    """Build a backend for one arm: ``numba`` and ``cuda`` are fused kernels, ``torch`` is the differentiable reference.
+    """Build a backend for one arm.
+
+    ``numba`` and ``cuda`` are fused kernels, ``torch`` is the differentiable reference, ``pyelastica`` is PyElastica.
 
     Raises:
         ValueError: for a name that is not in ``BACKENDS``, or if the backend cannot hold such a rod.
+        UserError: ``pyelastica`` where PyElastica is not installed, or has no such contact.
     """
     registered = _registered(name)
     backend: Backend = getattr(import_module(registered.module), registered.factory)(parameters)
@@ -92,20 +100,22 @@ def runs_on(name: str, device_type: str) -> bool:
     return device_type in _registered(name).device_types
 
 
-def check_backend(name: str, device_type: str) -> None:
-    """Refuse a backend that does not run on a device type (``cpu``, ``cuda``).
+def check_backend(name: str, device_type: str, dtype: str = "float64") -> None:
+    """Refuse a backend that does not run on a device type (``cpu``, ``cuda``), or not in a state's type.
 
     Raises:
-        ValueError: for a name that is not in ``BACKENDS``, or saying which device and which backends would do.
+        ValueError: for a name that is not in ``BACKENDS``, or saying which device, backends or type would do.
     """
-    if runs_on(name, device_type):
-        return
-    others = [other for other in _REGISTRY if runs_on(other, device_type)]
-    instead = f", or backend={' or '.join(others)}" if others else ""
-    raise ValueError(
-        f"backend={name} does not run on device={device_type}: "
-        f"choose device={' or '.join(_registered(name).device_types)}{instead}"
-    )
+    registered = _registered(name)
+    if not runs_on(name, device_type):
+        others = [other for other in _REGISTRY if runs_on(other, device_type)]
+        instead = f", or backend={' or '.join(others)}" if others else ""
+        raise ValueError(
+            f"backend={name} does not run on device={device_type}: "
+            f"choose device={' or '.join(registered.device_types)}{instead}"
+        )
+    if dtype not in registered.dtypes:
+        raise ValueError(f"backend={name} has no dtype={dtype}: add dtype={' or '.join(registered.dtypes)}")
 
 
 def _registered(name: str) -> _Registered:

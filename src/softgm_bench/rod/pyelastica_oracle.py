@@ -1,4 +1,8 @@
-"""PyElastica 1.0.0 itself, an optional extra, is the oracle of a rod's trajectory and is driven as our backends are."""
+"""PyElastica 1.0.0 itself, an optional extra, is the oracle of a rod's trajectory and is driven as our backends are.
+
+``simulate`` lets it run from rest, undisturbed, for tests and benchmarks; ``pyelastica_backend`` makes it one of the
+backends. Both move an ``Arm``.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -10,11 +14,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from softgm_bench.rod.compiling import njit
 from softgm_bench.rod.parameters import RodParameters
 from softgm_bench.rod.state import Cylinders
 
 Array = NDArray[np.float64]
 UP = (0.0, 0.0, 1.0)
+ROUNDING = 1e-4  # m by which a cylinder must be out of reach, far more than what rounding could make of it
 
 
 class Post(NamedTuple):
@@ -54,7 +60,7 @@ class Loads:
     """These loads act in the current control step: couple ``(3, n_elements)`` in N m, force ``(3, n_nodes)`` in N."""
 
     def __init__(self, couple: Array, force: Array | None = None) -> None:
-        """Begin with this couple and this force; without a force there never is one."""
+        """Begin with this couple and this force; None: there is none."""
         self.couple, self.force = couple, force
 
 
@@ -84,7 +90,7 @@ class _LargestContactForce(ea.NoForces):
 
 
 class _Pruning:
-    """Compute every pair and count the contacts that PyElastica's bounding boxes would have skipped.
+    """Compute every pair within reach and count the contacts that PyElastica's bounding boxes would have skipped.
 
     With ``apply`` those contacts are counted as well, but what they add to the forces is taken back: PyElastica as
     shipped.
@@ -97,6 +103,8 @@ class _Pruning:
         self._forces = module._calculate_contact_forces_rod_cylinder
 
     def prune(self, *arguments) -> int:
+        if _out_of_reach(*arguments):
+            return 1
         self.skips = bool(self._prune(*arguments))
         return 0
 
@@ -112,8 +120,29 @@ class _Pruning:
             external_forces[...] = before
 
 
+@njit(error_model="numpy")
+def _out_of_reach(position, radius, length, centre, director, cylinder_radius, cylinder_length):
+    """Whether a cylinder is too far for any contact, so that computing it would add nothing.
+
+    An element touches from its midpoint along its whole edge: no point of it is nearer than its midpoint by more than
+    its length.
+    """
+    for k in range(radius.shape[0]):
+        along = square = 0.0
+        for i in range(3):
+            apart = 0.5 * (position[i, k] + position[i, k + 1]) - centre[i, 0]
+            along += apart * director[2, i, 0]
+            square += apart * apart
+        beyond = max(abs(along) - 0.5 * cylinder_length, 0.0)
+        reach = radius[k] + cylinder_radius + length[k] + ROUNDING
+        if not max(square - along * along, 0.0) + beyond * beyond > reach * reach:  # or what is not finite
+            return False
+    return True
+
+
 @contextmanager
-def _watched_pruning(apply: bool) -> Iterator[_Pruning]:
+def watched_pruning(apply: bool) -> Iterator[_Pruning]:
+    """Switch PyElastica's pruning off, or with ``apply`` on, and count in ``missed`` the contacts that it misses."""
     module, pruning = elastica.contact_forces, _Pruning(apply)
     module._prune_using_aabbs_rod_cylinder = pruning.prune
     module._calculate_contact_forces_rod_cylinder = pruning.forces
@@ -163,6 +192,44 @@ def build(
     return simulator, arms[0]
 
 
+class Arm:
+    """An arm at rest among fixed posts, in a simulator of its own, is moved by whole control steps."""
+
+    def __init__(self, parameters: RodParameters, posts: Sequence[Post] = ()) -> None:
+        """Build the simulator."""
+        self._parameters = parameters
+        self._loads = Loads(np.zeros((3, parameters.n_elements)))
+        self._simulator, self._rod = build(parameters, self._loads, posts)
+        self._largest = [0.0]
+        if posts:
+            weight = np.array(parameters.gravity)[:, None] * self._rod.mass
+            self._simulator.add_forcing_to(self._rod).using(
+                _LargestContactForce, record=self._largest, weight=weight, loads=self._loads
+            )
+        self._simulator.finalize()
+        self._stepper, self._time = ea.PositionVerlet(), np.float64(0.0)
+
+    @property
+    def state(self) -> tuple[Array, ...]:
+        """Give PyElastica's own position, director, velocity and omega, as ``History`` has them without the time.
+
+        They are its whole state between two steps: what is written into them is where the next step begins.
+        """
+        return tuple(getattr(self._rod, f"{name}_collection") for name in ("position", "director", "velocity", "omega"))
+
+    def control_step(self, couple: Array, force: Array | None = None, substeps: int | None = None) -> float:
+        """Move by a control step under a couple ``(3, n_elements)`` in N m and a force ``(3, n_nodes)`` in N.
+
+        Returns:
+            The largest force of the posts on any node within the step, N.
+        """
+        self._loads.couple, self._loads.force = couple, force
+        self._largest[0] = 0.0
+        for _ in range(self._parameters.substeps if substeps is None else substeps):
+            self._time = self._stepper.step(self._simulator, self._time, np.float64(self._parameters.dt))
+        return self._largest[0]
+
+
 def simulate(
     parameters: RodParameters,
     couple: Callable[[int], Array],
@@ -175,27 +242,13 @@ def simulate(
 
     PyElastica skips cylinders by bounding boxes, which miss contacts: only with ``pruning`` it does so here.
     """
-    push = np.zeros((3, parameters.n_nodes))
-    loads = Loads(np.zeros((3, parameters.n_elements)), None if force is None else push)
-    simulator, rod = build(parameters, loads, posts)
-    weight = np.array(parameters.gravity)[:, None] * rod.mass
-    largest: list[float] = []
-    simulator.add_forcing_to(rod).using(_LargestContactForce, record=largest, weight=weight, loads=loads)
-    simulator.finalize()
-
-    stepper, time, states = ea.PositionVerlet(), np.float64(0.0), []
-    with _watched_pruning(pruning) as watched:
+    arm, forces, states = Arm(parameters, posts), [], []
+    with watched_pruning(pruning) as watched:
         for step in range(steps):
-            loads.couple[...] = couple(step)
-            if force is not None:
-                push[...] = force(step)
-            largest.append(0.0)
-            for _ in range(parameters.substeps):
-                time = stepper.step(simulator, time, np.float64(parameters.dt))
-            collections = (rod.position_collection, rod.director_collection, rod.velocity_collection)
-            states.append([array.copy() for array in (*collections, rod.omega_collection)])
+            forces.append(arm.control_step(couple(step), None if force is None else force(step)))
+            states.append([array.copy() for array in arm.state])
     position, director, velocity, omega = (np.stack(series) for series in zip(*states, strict=True))
-    return History(position, director, velocity, omega, np.array(largest), watched.missed)
+    return History(position, director, velocity, omega, np.array(forces), watched.missed)
 
 
 def _add_fixed_cylinder(
@@ -217,6 +270,14 @@ def _add_fixed_cylinder(
             velocity_damping_coefficient=parameters.velocity_damping_coefficient,
             friction_coefficient=parameters.friction_coefficient,
         )
+
+
+def posts_of(cylinders: Cylinders, row: int) -> tuple[Post, ...]:
+    """Make posts of the cylinders that exist in one environment."""
+    columns = (getattr(cylinders, name)[row][cylinders.mask[row]].double().tolist() for name in Post._fields)
+    return tuple(
+        Post(tuple(start), tuple(axis), length, radius) for start, axis, length, radius in zip(*columns, strict=True)
+    )
 
 
 def as_cylinders(per_environment: Sequence[Sequence[Post]], dtype: torch.dtype = torch.float64) -> Cylinders:

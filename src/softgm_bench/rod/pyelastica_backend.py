@@ -1,0 +1,103 @@
+"""PyElastica itself is a backend too: each arm in a simulator of its own, one after the other, on one core."""
+
+import torch
+from torch import Tensor
+
+from softgm_bench.errors import UserError
+from softgm_bench.rod.parameters import RodParameters
+from softgm_bench.rod.state import Cylinders, RodState, check_inputs, refuse_gradients
+
+
+class PyElasticaBackend:
+    """This backend has PyElastica 1.0.0 move the rods, in float64 on the CPU, and equals ``TorchBackend`` to round-off.
+
+    It is for confirming what the others say: a loop in Python over environments and substeps, some hundred times as
+    slow as ``NumbaBackend``.
+
+    Attributes:
+        parameters: of the arm.
+        contact_force: the largest force of the cylinders on any node within the last step, N, ``(num_envs,)`` float64.
+        missed: contacts (cylinder and substep) that PyElastica's bounding boxes did not, or would not, let through, in
+            all steps until now.
+    """
+
+    def __init__(self, parameters: RodParameters, pruning: bool = False) -> None:
+        """Prepare for one arm; PyElastica compiles at the first step.
+
+        Args:
+            parameters: of the arm.
+            pruning: PyElastica skips cylinders by its bounding boxes as it is shipped, which may miss contacts.
+
+        Raises:
+            UserError: PyElastica is not installed, or has no such contact.
+        """
+        try:
+            import softgm_bench.rod.pyelastica_oracle as oracle
+        except ImportError as error:
+            raise UserError("backend=pyelastica needs PyElastica: pip install '.[pyelastica]'") from error
+        if parameters.contact_model != "pyelastica":
+            raise UserError(
+                f"rod.contact_model={parameters.contact_model} with backend=pyelastica: PyElastica has no such "
+                "contact; choose rod.contact_model=pyelastica, or another backend"
+            )
+        self.parameters, self.missed = parameters, 0
+        self.contact_force = torch.zeros(0, dtype=torch.float64)
+        self._oracle, self._pruning = oracle, pruning
+        self._arms: dict[tuple[oracle.Post, ...], oracle.Arm] = {}
+
+    def control_step(
+        self,
+        state: RodState,
+        couple: Tensor,
+        force: Tensor | None = None,
+        cylinders: Cylinders | None = None,
+        active: Tensor | None = None,
+        substeps: int | None = None,
+    ) -> RodState:
+        """Advance every rod by one control step.
+
+        A simulator is built where cylinders are met for the first time and kept while they are met. It is told each
+        rod's state before the step, so rods among the same cylinders share it.
+
+        Args:
+            state: not changed; float64 on the CPU.
+            couple: external couple on elements in the material frame, N m, ``(num_envs, 3, n_elements)``.
+            force: external force on nodes in the world frame, N, ``(num_envs, 3, n_nodes)``; gravity is added.
+            cylinders: what the rods may touch.
+            active: ``(num_envs,)`` bool; rods that are not come back as they were.
+            substeps: of this step, the parameters' number by default.
+
+        Returns:
+            A new state.
+
+        Raises:
+            ValueError: if the arguments' shapes do not fit together, the state is not float64 on the CPU, or a gradient
+                is asked for.
+        """
+        check_inputs(self.parameters, state, couple, force, cylinders, active)
+        refuse_gradients("pyelastica", couple, force, state.position, state.director, state.velocity, state.omega)
+        if state.position.dtype != torch.float64 or state.position.device.type != "cpu":
+            raise ValueError(
+                f"the state is {state.position.dtype} on {state.position.device}: the pyelastica backend computes in "
+                "float64 on the CPU"
+            )
+        new = state.clone()
+        num_envs = len(couple)
+        rows = range(num_envs) if active is None else active.nonzero().flatten().tolist()
+        posts = {row: () if cylinders is None else self._oracle.posts_of(cylinders, row) for row in rows}
+        self._arms = {met: self._arms.get(met) or self._oracle.Arm(self.parameters, met) for met in posts.values()}
+        self.contact_force = torch.zeros(num_envs, dtype=torch.float64)
+        couples = couple.detach().double().numpy()
+        forces = None if force is None else force.detach().double().numpy()
+        with self._oracle.watched_pruning(self._pruning) as watched:
+            for row, met in posts.items():
+                arm = self._arms[met]
+                fields = [field[row].numpy() for field in (new.position, new.director, new.velocity, new.omega)]
+                for theirs, ours in zip(arm.state, fields, strict=True):
+                    theirs[...] = ours
+                push = None if forces is None else forces[row]
+                self.contact_force[row] = arm.control_step(couples[row], push, substeps)
+                for theirs, ours in zip(arm.state, fields, strict=True):
+                    ours[...] = theirs
+        self.missed += watched.missed
+        return new
