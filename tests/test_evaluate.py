@@ -94,6 +94,7 @@ def test_an_evaluation_leaves_its_episodes_and_a_summary_of_them(run, tmp_path):
         "batch": None,
         "intervention": "none",
         "device": "cpu",
+        "backend": "numba",
         "discount": 0.99,
         "threads": 1,
         "overrides": ["rod.n_elements=20", "task=wall", "perturbation=noise", "perturbation.position_sigma=0.2"],
@@ -179,6 +180,28 @@ def test_repeating_a_finished_evaluation_shows_its_table_and_plays_nothing(run, 
     assert (tmp_path / "x/summary.json").stat().st_mtime_ns == before
 
 
+def test_an_evaluation_in_pyelastica_says_so_and_is_that_of_the_fused_kernel(run, tmp_path):
+    for backend in ("numba", "pyelastica"):
+        status, out, err = run(SOFTGM, *QUICK, f"backend={backend}", f"out={backend}")
+        assert (status, err) == (0, "")
+        assert ("in PyElastica" in out) == (backend == "pyelastica")
+        assert json.loads((tmp_path / backend / "summary.json").read_text())["backend"] == backend
+    ours, theirs = (columns(tmp_path / backend / "episodes.csv") for backend in ("numba", "pyelastica"))
+    for name in ours:
+        if "True" not in ours[name] and "False" not in ours[name]:
+            np.testing.assert_allclose(np.float64(ours[name]), np.float64(theirs[name]), rtol=1e-5, err_msg=name)
+
+
+def test_an_evaluation_of_before_backends_were_told_is_known_again(run, tmp_path):
+    run(SOFTGM, *QUICK, "out=x")
+    path = tmp_path / "x/summary.json"
+    held = json.loads(path.read_text())
+    del held["backend"]
+    path.write_text(json.dumps(held))
+    assert "evaluated before" in run(SOFTGM, *QUICK, "out=x")[1]
+    assert run(SOFTGM, *QUICK, "backend=torch", "out=x")[0] == 2  # another evaluation
+
+
 @pytest.mark.parametrize(
     "other", [(MAPPO,), (SOFTGM, "episodes=4"), (SOFTGM, "horizon=5"), (SOFTGM, "perturbation=noise")]
 )
@@ -245,6 +268,15 @@ MISTAKES = {
     "the other device's kernel": (
         [SOFTGM, "backend=cuda"],
         "backend=cuda does not run on device=cpu: choose device=cuda",
+    ),
+    "PyElastica in single precision": (
+        [SOFTGM, "backend=pyelastica", "dtype=float32"],
+        "backend=pyelastica has no dtype=float32: add dtype=float64",
+    ),
+    "PyElastica on a GPU": ([SOFTGM, "backend=pyelastica", "device=cuda"], "device=cuda"),
+    "a contact that PyElastica has not": (
+        [SOFTGM, "backend=pyelastica", "rod.contact_model=exact"],
+        "rod.contact_model=exact with backend=pyelastica: PyElastica has no such contact",
     ),
     "a file in the way": (
         [SOFTGM, "out=cut.pt/x"],

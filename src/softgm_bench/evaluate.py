@@ -21,7 +21,9 @@ SOURCE is a run folder (its newest checkpoint), a checkpoint or a policy's file.
 Any other setting changes what the policy acts in:
 
   task=wall                      any task of conf/task, also one that it was not trained on
-  task.n_agents=8                any single setting of the task; rod.<key>, backend and dtype likewise
+  task.n_agents=8                any single setting of the task; rod.<key> and dtype likewise
+  backend=pyelastica             PyElastica itself moves the arm: slow, float64 alone, pip install '.[pyelastica]';
+                                 numba, torch (CPU), cuda and torch (GPU) are the same arm's implementations of ours
   perturbation=noise             none, noise, section_failure or disturbance (conf/perturbation)
   perturbation.tip_force=30      any single setting of it
 """
@@ -89,6 +91,8 @@ def _evaluate(arguments: list[str]) -> None:
     folder = Path(options.out or evaluation_folder.default_folder(source, trained, overrides, options.seed, unusual))
     under = trained.config.perturbation.name
     shown = f", intervention {intervention}" if intervention else ""
+    if policy.backend_of(trained.config) == "pyelastica":
+        shown += ", in PyElastica"
     title = f"{trained.label} on {trained.config.task.name}, perturbation {under}{shown}, seed {options.seed}:"
     if not options.overwrite:
         held = evaluation_folder.same(folder, trained, options.episodes, options.describe(trained, overrides))

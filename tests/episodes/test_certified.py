@@ -47,6 +47,16 @@ def test_committed_files_are_of_the_tasks_as_they_are(path):
     assert known.task == path.stem
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_committed_sequences_succeed_in_pyelastica_whose_evaluations_count_them_too(path):
+    known, theirs = certified.load(path), dataclasses.replace(config(path.stem), backend="pyelastica")
+    short = np.flatnonzero(known.length)[np.argsort(known.length[known.length > 0], kind="stable")][:3]
+    assert certified.replay(known, theirs, short).all()
+    mask = certified.mask(theirs, known.scenes, known.seed, None, None)
+    np.testing.assert_array_equal(mask, known.length > 0)
+
+
 def test_other_actions_do_not_succeed():
     path = FILES[0]
     known = certified.load(path)

@@ -49,12 +49,12 @@ def same(folder: Path, trained: TrainedPolicy, episodes: int, settings: Mapping[
     """Read the summary of an evaluation of the same policy with the same settings, if ``folder`` holds it.
 
     Threads may differ, which changes no more than rounding. An evaluation that does not tell its policy's parameters,
-    of an earlier version, is none.
+    of an earlier version, is none. One that does not tell its backend had the one that its settings mean.
     """
     try:
         held = json.loads(RunFolder(folder).summary.read_text())
         wanted = json.loads(to_json(_about(trained, settings)))
-        known = {key: held.get(key) for key in wanted}
+        known = {key: held.get(key) for key in wanted} | {"backend": held.get("backend", wanted["backend"])}
         alike = known | {"threads": None} == wanted | {"threads": None} and held["metrics"]["episodes"] == episodes
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None

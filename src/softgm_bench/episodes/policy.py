@@ -17,7 +17,7 @@ from softgm_bench.config.explain import USER_ERRORS
 from softgm_bench.envs import Sizes, kind_of
 from softgm_bench.errors import UserError
 from softgm_bench.models.finite import not_finite
-from softgm_bench.rod.backend import runs_on
+from softgm_bench.rod.backend import default_backend, runs_on
 from softgm_bench.storage import archive
 from softgm_bench.storage.files import write_where_asked
 from softgm_bench.storage.run_folder import RunFolder
@@ -114,6 +114,13 @@ def fingerprint(trained: TrainedPolicy) -> str:
         if isinstance(value, torch.Tensor):
             digest.update(value.contiguous().numpy(force=True).tobytes())
     return digest.hexdigest()[:16]
+
+
+def backend_of(config: Config) -> str | None:
+    """Name the implementation of the rod that a policy acts on; None where the task has no arm."""
+    if not kind_of(config.task).has_arm:
+        return None
+    return config.backend or default_backend(device_type(config.device))
 
 
 def _file(path: Path) -> Path:

@@ -109,6 +109,8 @@ class Protocol:
         """Give the settings as ``summary.json`` has them, with ``overrides`` on top of the policy's own."""
         import torch
 
+        from softgm_bench.episodes.policy import backend_of
+
         return {
             "evaluation_seed": self.seed,
             "deterministic": self.deterministic,
@@ -116,6 +118,7 @@ class Protocol:
             "batch": self.batch,
             "intervention": self.intervention,
             "device": trained.config.device.partition(":")[0],
+            "backend": backend_of(trained.config),
             "discount": self.gamma,
             "threads": torch.get_num_threads(),
             "overrides": list(overrides),
