@@ -45,6 +45,27 @@ def test_the_tables_of_the_results_are_made_from_the_committed_runs(results):
     assert any(results.runs(task) for task in results.TASKS)
 
 
+@pytest.fixture(scope="module")
+def sim_to_sim():
+    return script(ROOT / "experiments" / "sim_to_sim.py")
+
+
+def test_the_table_of_policies_in_pyelastica_is_made_from_the_committed_episodes(sim_to_sim):
+    page = sim_to_sim.PAGE.read_text()
+    assert sim_to_sim.page(page) == page
+
+
+@pytest.mark.parametrize("task", ["basic", "structured", "wall"])
+def test_simulators_that_are_compared_played_the_same_scenes_with_the_same_policy(sim_to_sim, task):
+    ours, *theirs = (sim_to_sim.summary(task, place) for place in ("numba", "pyelastica", "pyelastica_as_shipped"))
+    told = ("backend", "overrides", "pruning", "metrics")
+    for summary, pruning in zip(theirs, (False, True), strict=True):
+        assert (ours["backend"], summary["backend"], summary["pruning"]) == ("numba", "pyelastica", pruning)
+        assert {key: ours[key] for key in ours if key not in told} == {
+            key: summary[key] for key in summary if key not in told
+        }
+
+
 @pytest.mark.parametrize("path", POLICIES, ids=lambda path: path.stem)
 def test_a_kept_policy_belongs_to_a_committed_run(path, results):
     trained = policy.load(path)
