@@ -3,7 +3,7 @@ import itertools
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given, settings, strategies
 from observations import COUNTS, LEADS, SEEDS, SIZES, observation, randomise, softgm_config
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
@@ -162,6 +162,29 @@ def test_an_agent_reaches_as_many_neighbours_as_stage_two_has_layers(entry, move
         model = encoder(torch.float64, layers=layers)
         changed = ((model(td.double()) - model(other.double())).abs() > 1e-13).any(dim=-1).any(dim=0)
         assert changed.tolist() == [abs(agent - moved) <= layers for agent in range(6)]
+
+
+@settings(max_examples=30, deadline=None)
+@given(strategies.integers(1, 5), strategies.integers(1, 4), strategies.sampled_from([1, 2]), SEEDS)
+def test_agents_further_than_the_layers_reach_do_not_notice_that_the_chain_goes_on(n_agents, more, layers, seed):
+    longer = observation((2,), n_agents + more, 4, seed=seed, dtype=torch.float64)
+    shorter = longer.clone()
+    shorter["agents"] = longer["agents"].apply(lambda value: value[:, :n_agents])
+    model = encoder(torch.float64, layers=layers)
+    deaf = max(n_agents - layers, 0)
+    long, short = model(longer), model(shorter)
+    torch.testing.assert_close(long[:, :deaf], short[:, :deaf], rtol=0.0, atol=1e-13)
+    assert ((long[:, deaf:n_agents] - short[:, deaf:]).abs() > 1e-13).any(dim=-1).all()
+
+
+@settings(max_examples=30, deadline=None)
+@given(COUNTS, SEEDS)
+def test_a_chain_that_is_counted_from_the_other_end_gives_the_same_embeddings_in_that_order(sizes, seed):
+    td = observation((2,), *sizes, seed=seed, dtype=torch.float64)
+    reversed_td = td.clone()
+    reversed_td["agents"] = td["agents"].apply(lambda value: value.flip(1))
+    model = encoder(torch.float64)
+    torch.testing.assert_close(model(reversed_td).flip(1), model(td), rtol=0.0, atol=1e-12)
 
 
 def test_without_stage_two_an_agent_hears_no_agent():

@@ -1,12 +1,14 @@
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from analytical import relax, stiffness
 from hypothesis import given, settings, strategies
 from scipy.interpolate import CubicSpline
 
-from softgm_bench.rod.actuation import Actuation, control_points, torque_basis
+from softgm_bench.rod.actuation import BASES, Actuation, control_points, torque_basis
 from softgm_bench.rod.parameters import RodParameters
 
 ARM = RodParameters()
@@ -52,16 +54,65 @@ def test_an_element_receives_the_couple_per_length_times_its_length():
     assert np.allclose(per_element, couple * 60)
 
 
-def largest(basis):
+def largest(basis, n_agents=6):
     """The largest torque along the arm for amplitudes in [-1, 1]: the maximum of the sum of absolute values."""
-    return float(np.abs(torque_basis(6, np.linspace(0.0, 1.0, 100_001), 1.0, basis)).sum(axis=0).max())
+    return float(np.abs(torque_basis(n_agents, np.linspace(0.0, 1.0, 100_001), 1.0, basis)).sum(axis=0).max())
 
 
 def test_between_control_points_the_interpolating_basis_exceeds_the_limit_as_the_page_says():
     assert largest("interpolating") == pytest.approx(1.67, abs=0.005)
     assert largest("bspline") <= 1.0 + 1e-12
-    page = (Path(__file__).parents[2] / "docs/environment.md").read_text()
-    assert f"{largest('interpolating'):.2f}" in page
+    assert f"{largest('interpolating'):.2f}" in page()
+
+
+def page():
+    return (Path(__file__).parents[2] / "docs/environment.md").read_text()
+
+
+def end_weight(n_agents):
+    """Of the integral of the not-a-knot spline through N + 2 points, one apart: what a value of 1 at an end adds."""
+    value = np.zeros(n_agents + 2)
+    value[0] = 1.0
+    return float(CubicSpline(np.arange(n_agents + 2), value, bc_type="not-a-knot").integrate(0, n_agents + 1))
+
+
+@pytest.mark.parametrize("length", [1.0, 0.7])
+@pytest.mark.parametrize("n_agents", [2, 4, 5, 6, 7, 8, 9, 12])
+def test_the_couple_of_the_whole_arm_at_one_action_is_the_pages_formula(n_agents, length):
+    arm = RodParameters(base_length=length, n_elements=2000, dt=1e-5)
+    action = torch.full((1, n_agents, 2), 0.4, dtype=torch.float64)
+    total = {basis: Actuation(arm, n_agents, 25.0, basis).couple(action)[0].sum(dim=-1) for basis in BASES}
+    share = 1.0 - 2.0 * end_weight(n_agents) / (n_agents + 1)
+    assert total["interpolating"].tolist() == pytest.approx([0.4 * 25.0 * length * share] * 2 + [0.0], rel=1e-5)
+    if n_agents > 2:
+        share = 1.0 - 0.5 / (n_agents - 1)
+        assert total["bspline"].tolist() == pytest.approx([0.4 * 25.0 * length * share] * 2 + [0.0], rel=1e-5)
+
+
+def test_the_page_has_the_weights_couples_and_peaks_of_every_number_of_sections():
+    rows = dict(re.findall(r"^\| `(w_N|C_N|peak)`[^|]* \| (.*) \|$", page(), re.MULTILINE))
+    counts = [int(n) for n in re.findall(r"^\| N \| (.*) \|$", page(), re.MULTILINE)[0].split(" | ")]
+    assert {4, 6, 9, 12} <= set(counts)
+    expected = {
+        "w_N": [f"{end_weight(n):.4f}" for n in counts],
+        "C_N": [f"{1.0 - 2.0 * end_weight(n) / (n + 1):.3f}" for n in counts],
+        "peak": [f"{largest('interpolating', n):.2f}" for n in counts],
+    }
+    assert {name: row.split(" | ") for name, row in rows.items()} == expected
+
+
+@pytest.mark.parametrize("n_agents", [4, 6, 9])
+def test_the_arm_at_rest_under_one_action_has_turned_by_the_pages_angle(n_agents):
+    """Couples alone shear nothing, so this holds for any angle; of n elements the clamp holds the first one."""
+    arm = RodParameters(damping_protocol="uniform_damping_constant", damping_constant=4.0)
+    action = torch.tensor([0.0, 0.15], dtype=torch.float64).expand(1, n_agents, 2)
+    state = relax(arm, Actuation(arm, n_agents, 25.0).couple(action))
+    tangent = state.director[0, 2, :, -1]
+    turned = float(torch.atan2(tangent[:2].norm(), tangent[2]))
+    total = 0.15 * 25.0 * (1.0 - 2.0 * end_weight(n_agents) / (n_agents + 1))
+    expected = total * arm.base_length / (2.0 * stiffness(arm).bend) * (1.0 - 1.0 / arm.n_elements)
+    assert turned == pytest.approx(expected, rel=1e-3)
+    assert turned > 0.6
 
 
 @pytest.mark.parametrize(

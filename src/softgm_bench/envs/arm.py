@@ -62,7 +62,7 @@ def _build(settings: Settings, num_envs: int, seed: int, horizon: int | None, tr
 
 
 def _check(settings: Settings) -> None:
-    """Refuse time steps that are too long, and tasks that leave nothing to be drawn or draw what is out of reach.
+    """Refuse steps that are too long, more sections than nodes, and tasks with nothing to draw or out of reach.
 
     Scenes are drawn on the CPU, where ranges that leave nothing show.
 
@@ -72,6 +72,11 @@ def _check(settings: Settings) -> None:
     forks.check()  # before tensors are computed with
     config, rod = settings.task, settings.rod
     check_time_step(rod)
+    if config.n_agents >= rod.n_elements:
+        raise ValueError(
+            f"task.n_agents={config.n_agents} with rod.n_elements={rod.n_elements}: each section needs an inner node of "
+            f"its own, which {rod.n_elements - 1} have; give fewer agents or rod.n_elements={config.n_agents + 1}"
+        )
     task, drawn = make_task(config), torch.Generator()
     scenes = [task.sample(SCENES, drawn)]
     if config.curriculum.enabled:

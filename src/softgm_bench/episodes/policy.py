@@ -151,9 +151,9 @@ def _actor_of(loss: Mapping[str, Any], policy: TensorDictModuleBase) -> dict[str
 
 def _fitted(file: Path, trained: TrainedPolicy) -> TensorDictModuleBase:
     """Build the trained policy for what is observed in ``trained.config`` instead of the run's task."""
-    config, run, slots = trained.config, trained.run, trained.sizes.n_slots
-    task = f"task={config.task.name}"
+    config, run = trained.config, trained.run
     if kind_of(config.task) is not kind_of(run.task):
+        task = f"task={config.task.name}"
         raise UserError(f"{file}: it was trained on {run.task.name}, whose observations are not those of {task}")
     check(replace(config, threads=None))  # the run's may be more than this machine has
     sizes = kind_of(config.task).sizes(config.task)
@@ -161,9 +161,17 @@ def _fitted(file: Path, trained: TrainedPolicy) -> TensorDictModuleBase:
     try:
         fitted.load_state_dict(trained.policy.state_dict())
     except RuntimeError as error:
-        advice = f": add task.slots={slots}" if slots and sizes.n_slots else ""
-        raise UserError(
-            f"{file}: its networks read {slots} obstacle slots, {task} with {config.task.n_agents} agents has "
-            f"{sizes.n_slots}{advice}"
-        ) from error
+        raise UserError(f"{file}: {_misfit(trained, sizes)}") from error
     return fitted
+
+
+def _misfit(trained: TrainedPolicy, sizes: Sizes) -> str:
+    """Say which size of what is observed the networks do not take; it is never the number of agents alone."""
+    held, task = trained.sizes, f"task={trained.config.task.name}"
+    if held.n_features != sizes.n_features:
+        return f"its networks read {held.n_features} numbers for each agent, {task} shows {sizes.n_features}"
+    if trained.run.oracle and held.n_privileged != sizes.n_privileged:
+        return f"its networks are told {held.n_privileged} numbers about a scene, {task} has {sizes.n_privileged}"
+    slots, agents = held.n_slots, sizes.n_agents
+    advice = f": add task.slots={slots}" if slots and sizes.n_slots else ""
+    return f"its networks read {slots} obstacle slots, {task} with {agents} agents has {sizes.n_slots}{advice}"
