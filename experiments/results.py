@@ -1,17 +1,22 @@
 """Tables and learning curves of all committed runs: ``python experiments/results.py``.
 
-Reads ``experiments/trained/<task>/<algorithm>/seed<seed>/`` and rewrites ``docs/learning_curves.png`` and the tables in
-``docs/results.md``, each between a line ``<!-- task -->`` and ``<!-- end -->``.
+Reads ``experiments/trained/<task>/<algorithm>/seed<seed>/`` and ``experiments/sections/<task>/<algorithm>/<setting>/``
+and rewrites ``docs/learning_curves.png`` and the tables in ``docs/results.md``, each between ``<!-- table -->`` and
+``<!-- end -->``.
 """
 
 import re
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 
-from softgm_bench.analysis.runs import Run, find
+from softgm_bench.analysis.runs import Columns, Run, find
+from softgm_bench.analysis.statistics import mcnemar
+from softgm_bench.episodes.summary import wilson_interval
 
 ROOT = Path(__file__).parents[1]
 RUNS = ROOT / "experiments" / "trained"
+SECTIONS = ROOT / "experiments" / "sections"
 PAGE = ROOT / "docs" / "results.md"
 PICTURE = ROOT / "docs" / "learning_curves.png"
 TASKS = ("basic", "structured", "wall")
@@ -19,6 +24,15 @@ HEADER = (
     "| algorithm | seed | frames | minutes | threads | success | 95 % interval | episodes | mean length "
     "| discounted return | torque, joint |"
 )
+AS_TRAINED = "n_agents-6"
+COUNTS = {f"N = {n}": f"n_agents-{n}" for n in (4, 5, 6, 7, 8, 9, 12)}  # folders by what a row says
+ELEMENTS = {f"{n} elements": f"n_elements-{n}" for n in (30, 90)}
+FOUR_SECTIONS = {"N = 4": "n_agents-4", "N = 6, torque field of four": "torque_sections-4"}
+ELSEWHERE = {  # tables: what acts where, as their columns, and their rows
+    "other sizes, basic": (("basic/softgm", "basic/mappo"), COUNTS | ELEMENTS),
+    "other sizes, wall": (("wall/softgm", "wall/mappo"), COUNTS),
+    "four sections": (("basic/softgm", "wall/softgm"), FOUR_SECTIONS),
+}
 
 
 @cache
@@ -69,13 +83,44 @@ def table(task: str) -> str:
     return "\n".join(rows)
 
 
+@cache
+def episodes_elsewhere() -> Mapping[str, Columns]:
+    """Episodes of the kept policies in other settings than they were trained with, by folder.
+
+    Raises:
+        SystemExit: a folder that holds no whole evaluation.
+    """
+    found = find(SECTIONS)
+    if found.problems:
+        raise SystemExit(f"{found.problems[0].folder}: {found.problems[0].reason}")
+    return {one.folder.partition("/")[2]: one.episodes for one in found.evaluations}
+
+
+def elsewhere(policies: Sequence[str], rows: Mapping[str, str]) -> str:
+    """Success in other settings as a Markdown table, each beside the same scenes with the settings of training."""
+    header = "".join(f" {policy} | 95 % interval | lost, won | p |" for policy in policies)
+    lines = [f"| tested with |{header}", "|" + " --- |" * (4 * len(policies) + 1)]
+    for row, folder in rows.items():
+        cells = [row]
+        for policy in policies:
+            usual, other = (episodes_elsewhere()[f"{policy}/{name}"]["success"] for name in (AS_TRAINED, folder))
+            low, high = wilson_interval(int(other.sum()), len(other))
+            cells += [f"{other.mean():.3f}", f"[{low:.3f}, {high:.3f}]"]
+            split = mcnemar(usual, other)
+            cells += ["-", "-"] if folder == AS_TRAINED else [f"{split.lost}, {split.won}", f"{split.p:.1g}"]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
 def page(text: str) -> str:
     """``docs/results.md`` with its tables made anew."""
-    for task in TASKS:
-        made = f"<!-- {task} -->\n\n{table(task)}\n\n<!-- end -->"
-        text, count = re.subn(rf"<!-- {task} -->.*?<!-- end -->", lambda _, made=made: made, text, flags=re.DOTALL)
+    tables = {task: table(task) for task in TASKS}
+    tables |= {name: elsewhere(*settings) for name, settings in ELSEWHERE.items()}
+    for name, lines in tables.items():
+        made = f"<!-- {name} -->\n\n{lines}\n\n<!-- end -->"
+        text, count = re.subn(rf"<!-- {name} -->.*?<!-- end -->", lambda _, made=made: made, text, flags=re.DOTALL)
         if count != 1:
-            raise SystemExit(f"{PAGE}: one place for the table of {task} expected, found {count}")
+            raise SystemExit(f"{PAGE}: one place for the table of {name} expected, found {count}")
     return text
 
 

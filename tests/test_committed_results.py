@@ -1,6 +1,9 @@
 import csv
 import importlib.util
 import itertools
+import json
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +13,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from softgm_bench.envs import entries, make_env
 from softgm_bench.episodes import policy
+from softgm_bench.rod.actuation import Actuation
 
 ROOT = Path(__file__).parents[1]
 POLICIES = sorted((ROOT / "experiments" / "policies").glob("*.pt"))
@@ -72,6 +76,58 @@ def test_a_kept_policy_belongs_to_a_committed_run(path, results):
     task = trained.config.task.name
     assert path.stem == f"{task}_{trained.config.label}"
     assert trained.frames in [run.final.frames for run in results.runs(task) if run.final.label == trained.config.label]
+
+
+def folders_elsewhere(results):
+    found = sorted(path.parent for path in results.SECTIONS.glob("*/*/*/summary.json"))
+    assert len(found) >= 20
+    return found
+
+
+def test_policies_were_tested_elsewhere_in_the_settings_that_their_folders_name_and_are_the_kept_ones(results):
+    names = {path.stem: policy.fingerprint(policy.load(path)) for path in POLICIES}
+    for folder in folders_elsewhere(results):
+        task, algo, name = folder.relative_to(results.SECTIONS).parts
+        summary = json.loads((folder / "summary.json").read_text())
+        assert (summary["policy"], summary["task"]) == (names[f"{task}_{algo}"], task), folder
+        assert (summary["metrics"]["episodes"], summary["horizon"]) == (200, 200 if task == "basic" else 400)
+        coarse = summary.get("torque_sections")
+        settings = [f"torque_sections={coarse}"] if coarse else summary["overrides"] or [results.AS_TRAINED]
+        changes = [re.sub(r"^(\w+\.)*(\w+)=", r"\2-", setting) for setting in settings]
+        assert "_".join(change for change in changes if not change.startswith("resting_tip")) == name, folder
+
+
+def test_what_is_discovered_with_six_and_twelve_sections_is_stated_as_the_committed_episodes_have_it(results):
+    page = " ".join(results.PAGE.read_text().split())
+    found = results.episodes_elsewhere()
+    for words, algo in (
+        (r"MAPPO discovers (\d+) bins an episode with six sections and (\d+) with twelve", "mappo"),
+        (r"SoftGM discovers (\d+) and (\d+), but", "softgm"),
+    ):
+        stated = re.search(words, page).groups()
+        bins = [found[f"wall/{algo}/n_agents-{n}"]["discovered_bins"].mean() for n in (6, 12)]
+        assert [f"{mean:.0f}" for mean in bins] == list(stated)
+    assert "Divergences: none" in page
+    assert not any(episodes["diverged"].any() for episodes in found.values())
+
+
+def test_a_coarse_torque_field_goes_through_the_policys_own_at_fewer_control_points(results):
+    coarse = script(ROOT / "experiments" / "coarse_torque.py")
+    trained = policy.load(ROOT / "experiments" / "policies" / "basic_softgm.pt")
+    task, rod = trained.config.task, trained.config.rod
+    own = Actuation(rod, task.n_agents, task.actuation.max_torque).matrix
+    torch.testing.assert_close(coarse.coarse_matrix(trained, task.n_agents), own, rtol=0.0, atol=1e-12)
+    fine = replace(rod, n_elements=2000, dt=1e-5)
+    trained.config = replace(trained.config, rod=fine)
+    action = torch.rand(6, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    whole = Actuation(fine, 6, 25.0).matrix
+    found, field = (action @ matrix for matrix in (coarse.coarse_matrix(trained, 4), whole))
+    places = torch.tensor([400, 800, 1200, 1600])
+    torch.testing.assert_close(found[places], field[places], rtol=2e-2, atol=1e-5)
+    page = " ".join(results.PAGE.read_text().split())
+    stated = re.search(r"(\d+) % with four [^,]*, (\d+) % with five, (\d+) % with seven and (\d+) % with twelve", page)
+    for share, sections in zip(stated.groups(), (4, 5, 7, 12), strict=True):
+        assert f"{100 * (coarse.coarse_matrix(trained, sections) - whole).norm() / whole.norm():.0f}" == share
 
 
 INTERVENTIONS = {

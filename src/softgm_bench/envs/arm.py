@@ -74,8 +74,8 @@ def _check(settings: Settings) -> None:
     check_time_step(rod)
     if config.n_agents >= rod.n_elements:
         raise ValueError(
-            f"task.n_agents={config.n_agents} with rod.n_elements={rod.n_elements}: each section needs an inner node of "
-            f"its own, which {rod.n_elements - 1} have; give fewer agents or rod.n_elements={config.n_agents + 1}"
+            f"task.n_agents={config.n_agents} with rod.n_elements={rod.n_elements}: every section needs an inner node "
+            f"of its own and there are {rod.n_elements - 1}; give fewer or rod.n_elements={config.n_agents + 1}"
         )
     task, drawn = make_task(config), torch.Generator()
     scenes = [task.sample(SCENES, drawn)]
