@@ -91,6 +91,7 @@ SMALL = {
     "attention": ["horizon=3", "threads=1"],
     "render": ["horizon=40", "threads=1", "width=64", "height=48"],
     "report": ["resamples=100"],
+    "certify": ["episodes=4", "minutes=0.1"],
 }
 
 

@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -46,8 +47,8 @@ def run(folder, *arguments):
 
 
 def cell_lines(output):
-    """Folder, outcome and the rest of each line about a cell."""
-    lines = [line for line in output.splitlines() if line.startswith("outputs/")]
+    """Folder, outcome and the rest of each line about a cell, ``[1 of 4] outputs/...: done, ...``."""
+    lines = re.findall(r"^\[\d+ of \d+\] (outputs/.*)$", output, re.MULTILINE)
     return {line.partition(": ")[0]: line.partition(": ")[2].partition(", ")[::2] for line in lines}
 
 
