@@ -1,22 +1,26 @@
 """Tables and learning curves of all committed runs: ``python experiments/results.py``.
 
-Reads ``experiments/trained/<task>/<algorithm>/seed<seed>/`` and ``experiments/sections/<task>/<algorithm>/<setting>/``
-and rewrites ``docs/learning_curves.png`` and the tables in ``docs/results.md``, each between ``<!-- table -->`` and
-``<!-- end -->``.
+Reads ``experiments/trained/<task>/<algorithm>/seed<seed>/``, ``experiments/sections/<task>/<algorithm>/<setting>/`` and
+``experiments/failures/wall/<algorithm>/``. Rewrites ``docs/learning_curves.png`` and the tables in ``docs/results.md``,
+each between ``<!-- table -->`` and ``<!-- end -->``.
 """
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 
 from softgm_bench.analysis.runs import Columns, Run, find
 from softgm_bench.analysis.statistics import mcnemar
+from softgm_bench.episodes import certified
 from softgm_bench.episodes.summary import wilson_interval
 
 ROOT = Path(__file__).parents[1]
 RUNS = ROOT / "experiments" / "trained"
 SECTIONS = ROOT / "experiments" / "sections"
+FAILURES = ROOT / "experiments" / "failures"
 PAGE = ROOT / "docs" / "results.md"
 PICTURE = ROOT / "docs" / "learning_curves.png"
 TASKS = ("basic", "structured", "wall")
@@ -32,6 +36,12 @@ ELSEWHERE = {  # tables: what acts where, as their columns, and their rows
     "other sizes, basic": (("basic/softgm", "basic/mappo"), COUNTS | ELEMENTS),
     "other sizes, wall": (("wall/softgm", "wall/mappo"), COUNTS),
     "four sections": (("basic/softgm", "wall/softgm"), FOUR_SECTIONS),
+}
+FAILING = ("softgm", "softgm_oracle", "mappo")
+SPLITS = {  # of the scenes of `wall`: what they are told apart by, m, and the borders
+    "from the opening's centre to the target, sideways": (0.0, 0.05, 0.10, 0.15, 0.20, math.inf),
+    "from the target up to the opening's centre": (-math.inf, -0.15, -0.05, 0.05, math.inf),
+    "height of the opening's centre": (0.35, 0.40, 0.45, 0.50, 0.55, math.inf),
 }
 
 
@@ -84,16 +94,39 @@ def table(task: str) -> str:
 
 
 @cache
-def episodes_elsewhere() -> Mapping[str, Columns]:
-    """Episodes of the kept policies in other settings than they were trained with, by folder.
+def episodes_in(folder: Path) -> Mapping[str, Columns]:
+    """Episodes of the kept policies' evaluations, by their folders below this one.
 
     Raises:
         SystemExit: a folder that holds no whole evaluation.
     """
-    found = find(SECTIONS)
+    found = find(folder)
     if found.problems:
         raise SystemExit(f"{found.problems[0].folder}: {found.problems[0].reason}")
     return {one.folder.partition("/")[2]: one.episodes for one in found.evaluations}
+
+
+def failures() -> str:
+    """Where on ``wall`` a solution is known and where policies succeed, as a Markdown table.
+
+    Raises:
+        SystemExit: the evaluations are not of the certified scenes.
+    """
+    known = certified.of_task("wall")
+    played = [episodes_in(FAILURES)[f"wall/{name}"]["success"] for name in FAILING]
+    if known is None or any(len(success) != known.scenes for success in played):
+        raise SystemExit(f"{FAILURES}: evaluations of the certified scenes expected")
+    opening, away = known.privileged[:, :3], known.privileged[:, :3] - known.target
+    lines = [f"| scenes | number | certified | {' | '.join(FAILING)} |", "|" + " --- |" * (len(FAILING) + 3)]
+    for (what, borders), value in zip(SPLITS.items(), (abs(away[:, 1]), away[:, 2], opening[:, 2]), strict=True):
+        for low, high in pairwise(borders):
+            here = (value >= low) & (value < high)
+            ends = [f"{end:.2f}" for end in (low, high) if math.isfinite(end)]
+            word = "" if len(ends) == 2 else "at least " if math.isinf(high) else "below "
+            shares = [one[here].mean() for one in (known.length > 0, *played)]
+            cells = [f"{what}: {word}{' to '.join(ends)} m", f"{here.sum()}", *(f"{share:.2f}" for share in shares)]
+            lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
 
 
 def elsewhere(policies: Sequence[str], rows: Mapping[str, str]) -> str:
@@ -103,7 +136,7 @@ def elsewhere(policies: Sequence[str], rows: Mapping[str, str]) -> str:
     for row, folder in rows.items():
         cells = [row]
         for policy in policies:
-            usual, other = (episodes_elsewhere()[f"{policy}/{name}"]["success"] for name in (AS_TRAINED, folder))
+            usual, other = (episodes_in(SECTIONS)[f"{policy}/{name}"]["success"] for name in (AS_TRAINED, folder))
             low, high = wilson_interval(int(other.sum()), len(other))
             cells += [f"{other.mean():.3f}", f"[{low:.3f}, {high:.3f}]"]
             split = mcnemar(usual, other)
@@ -115,7 +148,7 @@ def elsewhere(policies: Sequence[str], rows: Mapping[str, str]) -> str:
 def page(text: str) -> str:
     """``docs/results.md`` with its tables made anew."""
     tables = {task: table(task) for task in TASKS}
-    tables |= {name: elsewhere(*settings) for name, settings in ELSEWHERE.items()}
+    tables |= {name: elsewhere(*settings) for name, settings in ELSEWHERE.items()} | {"failures": failures()}
     for name, lines in tables.items():
         made = f"<!-- {name} -->\n\n{lines}\n\n<!-- end -->"
         text, count = re.subn(rf"<!-- {name} -->.*?<!-- end -->", lambda _, made=made: made, text, flags=re.DOTALL)
