@@ -78,6 +78,24 @@ def test_a_kept_policy_belongs_to_a_committed_run(path, results):
     assert trained.frames in [run.final.frames for run in results.runs(task) if run.final.label == trained.config.label]
 
 
+def test_the_kept_trial_is_the_policy_of_its_evaluations_and_the_page_says_what_they_hold(results):
+    page = results.PAGE.read_text()
+    folder = ROOT / "experiments/trials/wall/envs-128_promote-0.5_entropy-0.003/policy-2400000"
+    frames = policy.load(folder.with_suffix(".pt")).frames
+    rows = {"none": "what agents have sensed", "blind": "no obstacle", "swap_obstacles": "another scene's obstacles"}
+    summaries = [json.loads((folder / name / "summary.json").read_text()) for name in (*rows, "none_1000")]
+    assert len({summary["policy"] for summary in summaries}) == 1
+    assert {summary["frames"] for summary in summaries} == {frames} == {2_400_000}
+    for name, shown in rows.items():
+        summary = json.loads((folder / name / "summary.json").read_text())
+        assert summary["intervention"] == name
+        metrics = summary["metrics"]
+        cells = [f"{metrics[key]['mean']:.3f}" for key in ("success_rate", "success_certified")]
+        assert f"| the kept one, {shown} | {' | '.join(cells)} | {metrics['motionless_failures']} |" in page
+    success = summaries[-1]["metrics"]["success_rate"]
+    assert f"{success['mean']:.3f} [{success['low']:.3f}, {success['high']:.3f}] of 1000 scenes" in page
+
+
 def folders_elsewhere(results):
     found = sorted(path.parent for path in results.SECTIONS.glob("*/*/*/summary.json"))
     assert len(found) >= 20
