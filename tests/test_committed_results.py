@@ -117,7 +117,7 @@ def test_policies_were_tested_elsewhere_in_the_settings_that_their_folders_name_
 
 def test_what_is_discovered_with_six_and_twelve_sections_is_stated_as_the_committed_episodes_have_it(results):
     page = " ".join(results.PAGE.read_text().split())
-    found = results.episodes_elsewhere()
+    found = results.episodes_in(results.SECTIONS)
     for words, algo in (
         (r"MAPPO discovers (\d+) bins an episode with six sections and (\d+) with twelve", "mappo"),
         (r"SoftGM discovers (\d+) and (\d+), but", "softgm"),
