@@ -30,7 +30,7 @@ PARTS = ("simulator", "policy", "update", "framework")
 FRAMES = 12_800  # at least so many between two looks at the clock, of PPO; a tenth of it off-policy
 
 
-def measure(algo: str, task: str, repetitions: int, settings: Sequence[str] = ()) -> dict[str, Any]:
+def measure(algo: str, task: str, repetitions: int, threads: int, settings: Sequence[str] = ()) -> dict[str, Any]:
     """The fastest repetition, with further settings: frames per second and each part's share."""
     off_policy = algo in OFF_POLICY
     config = compose(
@@ -38,6 +38,7 @@ def measure(algo: str, task: str, repetitions: int, settings: Sequence[str] = ()
         + (["algo.random_frames=0"] if off_policy else [])
         + list(settings)
     )
+    set_threads(threads, config.matmul)
     experiment = config.experiment
     env = make_env(config.task, config.rod, experiment.num_envs, 0, experiment.train_horizon, stagger=True)
     algorithm = build_algorithm(config.algo, config.model, env)
@@ -87,7 +88,7 @@ def main() -> None:
     )
     parser.add_argument("--output", type=Path, default=Path("benchmarks/results/training.json"))
     options = parser.parse_args()
-    threads = set_threads(options.threads)
+    threads = options.threads
     keep_memory()
 
     print(f"{threads} thread(s); shares of the time in %: {', '.join(PARTS)}")
@@ -95,7 +96,7 @@ def main() -> None:
     rows = []
     for algo in options.algorithms:
         for task in options.tasks:
-            row = measure(algo, task, options.repetitions, options.settings)
+            row = measure(algo, task, options.repetitions, threads, options.settings)
             shares = "".join(f"{100.0 * row['shares'][part]:>6.1f}" for part in PARTS)
             print(f"{algo:<12}{task:<12}{row['frames_per_s']:>10.0f}  {shares}", flush=True)
             rows.append(row)
