@@ -56,7 +56,7 @@ class CudaBackend:
                 is asked for.
         """
         check_inputs(self.parameters, state, couple, force, cylinders, active)
-        refuse_gradients("cuda", couple, force, state.position, state.director, state.velocity, state.omega)
+        refuse_gradients("cuda", state, couple, force)
         device, dtype = state.position.device, state.position.dtype
         _check_device(device, couple=couple, force=force, active=active, cylinders=cylinders)
         if dtype not in REAL:

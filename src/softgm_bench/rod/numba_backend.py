@@ -61,7 +61,7 @@ class NumbaBackend:
         """
         check_inputs(self.parameters, state, couple, force, cylinders, active)
         forks.check()
-        refuse_gradients("numba", couple, force, state.position, state.director, state.velocity, state.omega)
+        refuse_gradients("numba", state, couple, force)
         dtype = state.position.dtype
         num_envs, n = couple.shape[0], self.parameters.n_elements
         rows, scalars, contact = self._table(dtype)

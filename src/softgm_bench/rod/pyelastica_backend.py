@@ -75,7 +75,7 @@ class PyElasticaBackend:
                 is asked for.
         """
         check_inputs(self.parameters, state, couple, force, cylinders, active)
-        refuse_gradients("pyelastica", couple, force, state.position, state.director, state.velocity, state.omega)
+        refuse_gradients("pyelastica", state, couple, force)
         if state.position.dtype != torch.float64 or state.position.device.type != "cpu":
             raise ValueError(
                 f"the state is {state.position.dtype} on {state.position.device}: the pyelastica backend computes in "

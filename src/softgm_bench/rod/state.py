@@ -79,12 +79,13 @@ def dilatation(position: Tensor, rest_length: Tensor) -> Tensor:
     return edges.norm(dim=-2) / rest_length
 
 
-def refuse_gradients(backend: str, *tensors: Tensor | None) -> None:
-    """Refuse tensors whose gradient would be asked for, in a kernel that has none.
+def refuse_gradients(backend: str, state: RodState, couple: Tensor, force: Tensor | None) -> None:
+    """Refuse a step whose gradient would be asked for, in a kernel that has none.
 
     Raises:
         ValueError: naming what would do.
     """
+    tensors = (couple, force, state.position, state.director, state.velocity, state.omega)
     if torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in tensors):
         raise ValueError(
             f"the action, force or state requires a gradient, and backend={backend} has none: "
