@@ -86,8 +86,7 @@ def test_the_kept_trial_is_the_policy_of_its_evaluations_and_the_page_says_what_
     summaries = [json.loads((folder / name / "summary.json").read_text()) for name in (*rows, "none_1000")]
     assert len({summary["policy"] for summary in summaries}) == 1
     assert {summary["frames"] for summary in summaries} == {frames} == {2_400_000}
-    for name, shown in rows.items():
-        summary = json.loads((folder / name / "summary.json").read_text())
+    for (name, shown), summary in zip(rows.items(), summaries, strict=False):
         assert summary["intervention"] == name
         metrics = summary["metrics"]
         cells = [f"{metrics[key]['mean']:.3f}" for key in ("success_rate", "success_certified")]

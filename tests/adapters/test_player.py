@@ -2,16 +2,14 @@
 
 import numpy as np
 import pytest
-import torch
 
 from softgm_bench import api
 from softgm_bench.adapters.gymnasium_vector import SoftArmGymnasiumEnv, SoftArmVectorEnv
 from softgm_bench.adapters.pettingzoo import parallel_env
 from softgm_bench.adapters.player import Player
-from softgm_bench.assembly import build_policy, configure
-from softgm_bench.envs import entries, kind_of
-from softgm_bench.episodes.policy import TrainedPolicy
+from softgm_bench.envs import entries
 from softgm_bench.errors import UserError
+from untrained_policy import untrained
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 ARM = ("rod.n_elements=20", "task.sensing_radius=0.4")
@@ -19,15 +17,8 @@ GRU = "algo.actor.memory={cell:gru,size:8}"
 HORIZON = 5
 
 
-def untrained(task, *overrides):
-    config = configure([f"task={task}", *ARM, "model.hidden=16", "recipe=paper", *overrides])
-    sizes = kind_of(config.task).sizes(config.task)
-    torch.manual_seed(0)
-    actor = build_policy(config, sizes)
-    with torch.no_grad():
-        for parameter in actor.parameters():
-            parameter.add_(0.2 * torch.randn_like(parameter))
-    return TrainedPolicy(actor, sizes, config, 0, {}, config)
+def fresh(task, *overrides):
+    return untrained(f"task={task}", *ARM, "model.hidden=16", "recipe=paper", *overrides)
 
 
 def expected(trained, num_envs, steps):
@@ -39,7 +30,7 @@ def expected(trained, num_envs, steps):
 
 @pytest.mark.parametrize(("task", "memory"), [("structured", GRU), ("basic", GRU), ("basic", "seed=0")])
 def test_a_player_of_pettingzoo_acts_as_the_policy_does_in_every_episode(task, memory):
-    trained = untrained(task, memory)
+    trained = fresh(task, memory)
     player = Player(trained)
     env = parallel_env(task, seed=4, horizon=HORIZON, overrides=ARM, observation="dict")
     found = []
@@ -54,7 +45,7 @@ def test_a_player_of_pettingzoo_acts_as_the_policy_does_in_every_episode(task, m
 
 
 def test_a_player_of_a_vector_of_environments_forgets_where_episodes_end():
-    trained = untrained("structured", GRU)
+    trained = fresh("structured", GRU)
     player, env = Player(trained), SoftArmVectorEnv("structured", 3, seed=4, horizon=HORIZON, overrides=ARM)
     observations, _ = env.reset()
     begins, found = None, []
@@ -66,7 +57,7 @@ def test_a_player_of_a_vector_of_environments_forgets_where_episodes_end():
 
 
 def test_a_player_of_one_gymnasium_environment_gives_one_action():
-    trained = untrained("basic", GRU)
+    trained = fresh("basic", GRU)
     player, env = Player(trained), SoftArmGymnasiumEnv("basic", seed=4, horizon=HORIZON, overrides=ARM)
     observation, _ = env.reset()
     for reference in expected(trained, 1, HORIZON):
@@ -76,7 +67,7 @@ def test_a_player_of_one_gymnasium_environment_gives_one_action():
 
 
 def test_observations_of_another_environment_are_refused_in_one_line():
-    player = Player(untrained("basic", GRU))
+    player = Player(fresh("basic", GRU))
     with pytest.raises(ValueError, match=r"^observations have 7 numbers: the policy's have 54$"):
         player.joint_actions(np.zeros((2, 7), dtype=np.float32))
     env = parallel_env("basic", seed=4, overrides=[*ARM, "task.n_agents=4"], observation="dict")
@@ -86,4 +77,4 @@ def test_observations_of_another_environment_are_refused_in_one_line():
 
 def test_an_oracle_is_no_player():
     with pytest.raises(UserError, match=r"^softgm_oracle on wall: it reads what no adapter shows$"):
-        Player(untrained("wall", "observation=oracle", "run_dir=oracle"))
+        Player(fresh("wall", "observation=oracle", "run_dir=oracle"))

@@ -7,26 +7,20 @@ import torch
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from softgm_bench import api
-from softgm_bench.assembly import build_env, build_policy, configure
-from softgm_bench.envs import entries, kind_of
+from softgm_bench.assembly import build_env
+from softgm_bench.envs import entries
 from softgm_bench.episodes import policy
 from softgm_bench.errors import UserError
+from untrained_policy import untrained
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 POLICIES = Path(__file__).parents[2] / "experiments" / "policies"
 SMALL = "rod.n_elements=20"
 
 
-def untrained(path, *overrides):
-    """Keep a policy with fresh networks, whose every term counts, and give its file."""
-    config = configure(["recipe=paper", *overrides])
-    sizes = kind_of(config.task).sizes(config.task)
-    torch.manual_seed(0)
-    actor = build_policy(config, sizes)
-    with torch.no_grad():
-        for parameter in actor.parameters():
-            parameter.add_(0.1 * torch.randn_like(parameter))
-    policy.save(policy.TrainedPolicy(actor, sizes, config, 0, {}, config), path)
+def keep(path, *overrides):
+    """Keep a policy with fresh networks and give its file."""
+    policy.save(untrained("recipe=paper", *overrides), path)
     return path
 
 
@@ -44,7 +38,7 @@ def test_a_kept_policy_reaches_targets_with_another_number_of_sections(algo, n_a
 @pytest.mark.parametrize("algo", ["softgm", "mappo"])
 def test_a_memory_is_kept_by_as_many_agents_as_there_are(algo, tmp_path):
     memory = ("task=structured", "task.sensing_radius=0.4", "model.hidden=16", "algo.actor.memory={cell:gru,size:8}")
-    kept = untrained(tmp_path / "kept.pt", f"algo={algo}", SMALL, *memory)
+    kept = keep(tmp_path / "kept.pt", f"algo={algo}", SMALL, *memory)
     for n_agents in (4, 9):
         settings = (f"task.n_agents={n_agents}",)
         trained = policy.load(kept, overrides=settings)
@@ -70,7 +64,7 @@ def test_off_policy_actors_that_explore_take_any_number_of_agents(deterministic)
 
 def test_a_vector_policy_takes_any_number_of_agents_and_no_other_observation(tmp_path):
     pytest.importorskip("vmas", reason="VMAS is an optional extra: pip install 'softgm-bench[vmas]'")
-    kept = untrained(tmp_path / "kept.pt", "task=vmas_balance", "algo=mappo", "model=vector_mlp")
+    kept = keep(tmp_path / "kept.pt", "task=vmas_balance", "algo=mappo", "model=vector_mlp")
     records = api.evaluate(kept, "task.scenario.n_agents=3", episodes=2, horizon=3).records
     assert (records["length"] == 3).all()
     said = r"^\S+: its networks read 16 numbers for each agent, task=vmas_navigation shows 18$"

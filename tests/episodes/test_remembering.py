@@ -14,6 +14,7 @@ from softgm_bench.episodes.evaluation import evaluate
 from softgm_bench.episodes.interventions import INTERVENTIONS
 from softgm_bench.errors import UserError
 from softgm_bench.rod.parameters import RodParameters
+from untrained_policy import untrained
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 SETTINGS = ("task=structured", "rod.n_elements=20", "task.sensing_radius=0.4", "recipe=paper")
@@ -23,14 +24,7 @@ GRU = "algo.actor.memory={cell:gru,size:8}"
 @pytest.fixture(scope="module", params=["softgm", "mappo"])
 def trained(request):
     """Not trained at all, but its actions depend on what it remembers."""
-    config = configure([*SETTINGS, f"algo={request.param}", "model.hidden=16", GRU])
-    sizes = kind_of(config.task).sizes(config.task)
-    torch.manual_seed(0)
-    actor = build_policy(config, sizes)
-    with torch.no_grad():
-        for parameter in actor.parameters():
-            parameter.add_(0.2 * torch.randn_like(parameter))
-    return policy.TrainedPolicy(actor, sizes, config, 0, {}, config)
+    return untrained(*SETTINGS, f"algo={request.param}", "model.hidden=16", GRU)
 
 
 def environment(trained, num_envs=4, horizon=6):
