@@ -32,9 +32,15 @@ def test_the_settings_of_every_committed_run_are_read_and_none_is_changed(path):
     written = OmegaConf.load(path)
     config = typed(written)
     assert_holds(plain(config), OmegaConf.to_container(written))
-    assert (config.recipe, config.experiment.name) == ("", "")
-    assert config.label == path.parent.parent.name
+    # A run from before these had names has none.
+    assert (config.recipe, config.experiment.name) == (written.get("recipe", ""), written.experiment.get("name", ""))
+    assert config.task.name in path.parts
     assert typed(OmegaConf.create(plain(config))) == config
+
+
+@pytest.mark.parametrize("path", sorted((EXPERIMENTS / "trained").rglob("config.yaml")), ids=relative)
+def test_the_label_of_every_published_run_is_the_name_of_its_folder(path):
+    assert typed(OmegaConf.load(path)).label == path.parent.parent.name
 
 
 @pytest.mark.parametrize("path", POLICIES, ids=relative)
