@@ -68,6 +68,7 @@ def actor_config(**changes):
         "mean_bound": 3.0,
         "persistence": 0.0,
         "embedding_norm": False,
+        "hidden_norm": False,
         "relative_points": False,
         "memory": None,
     }
@@ -75,7 +76,14 @@ def actor_config(**changes):
 
 
 def value_config(**changes):
-    values = {"widths": [8], "pooling": "mean", "mlp": None, "asymmetric": False, "embedding_norm": False}
+    values = {
+        "widths": [8],
+        "pooling": "mean",
+        "mlp": None,
+        "asymmetric": False,
+        "embedding_norm": False,
+        "hidden_norm": False,
+    }
     return ValueConfig(**(values | changes))
 
 

@@ -21,7 +21,7 @@ def critic(encoder, centralised, n_agents=5, seed=0):
         build_action_value(
             encoder,
             Sizes(n_agents, 2, n_slots=6),
-            ActionValueConfig(widths=[8], mlp=None, asymmetric=False, embedding_norm=False),
+            ActionValueConfig(widths=[8], mlp=None, asymmetric=False, embedding_norm=False, hidden_norm=False),
             centralised,
         )
     )
@@ -112,7 +112,7 @@ def test_the_teams_value_is_that_of_all_observations_and_then_all_actions(encode
 
 
 def test_a_critic_may_have_an_mlp_of_its_own_whatever_the_actors_model():
-    config = ActionValueConfig(widths=[8], mlp=MLP, asymmetric=False, embedding_norm=False)
+    config = ActionValueConfig(widths=[8], mlp=MLP, asymmetric=False, embedding_norm=False, hidden_norm=False)
     build = functools.partial(build_action_value, softgm_config(), Sizes(5, 2, n_slots=6), config)
     assert isinstance(build(centralised=True).encoder, MLPTeamEncoder)
     assert isinstance(build(centralised=False).encoder, MLPEncoder)
@@ -127,7 +127,7 @@ def test_only_an_asymmetric_critic_reads_what_is_privileged(centralised):
     plain = critic(MLP, centralised)
     assert entries.PRIVILEGED not in plain.in_keys
     assert torch.equal(value(plain, td), value(plain, other))
-    config = ActionValueConfig(widths=[8], mlp=None, asymmetric=True, embedding_norm=False)
+    config = ActionValueConfig(widths=[8], mlp=None, asymmetric=True, embedding_norm=False, hidden_norm=False)
     told = randomise(build_action_value(MLP, Sizes(5, 2, n_slots=6), config, centralised, n_privileged=4))
     assert entries.PRIVILEGED in told.in_keys
     assert value(told, td).shape == (7, 5, 1)

@@ -291,6 +291,48 @@ def test_saturation_is_of_the_heads_first_layer(encoder):
     assert actor_saturation(actor(encoder, widths=[]), td) == {}
 
 
+HIDDEN = pytest.mark.parametrize(
+    "build",
+    [
+        lambda norm: build_actor(softgm_config(), SIZES, actor_config(widths=[64, 64], hidden_norm=norm)),
+        lambda norm: build_value(softgm_config(), SIZES, value_config(widths=[64], hidden_norm=norm)),
+        lambda norm: build_value(
+            softgm_config(), SIZES, value_config(widths=[64], hidden_norm=norm, pooling="concat"), centralised=False
+        ),
+    ],
+    ids=["actor", "mean", "independent"],
+)
+
+
+@HIDDEN
+def test_a_normalised_head_is_the_same_however_large_its_weights(build):
+    torch.manual_seed(0)
+    network, td = build(True), observation((5,))
+    key = LOC if LOC in network.out_keys else STATE_VALUE
+    once = network(td.clone())[key]
+    with torch.no_grad():
+        function = next(module.function for module in network.modules() if hasattr(module, "function"))
+        linears = [layer for layer in function[:-1] if isinstance(layer, torch.nn.Linear)]
+        for layer in linears:
+            layer.weight *= 30.0
+            layer.bias *= 30.0
+    torch.testing.assert_close(network(td.clone())[key], once, rtol=1e-2, atol=1e-3)  # its epsilon counts less
+    plain = build(False)
+    assert not any(isinstance(module, torch.nn.LayerNorm) for module in plain.modules())
+
+
+def test_a_normalised_head_hardly_saturates_where_a_plain_one_does():
+    shares = {}
+    for norm in (False, True):
+        torch.manual_seed(0)
+        policy, td = actor(widths=[64], hidden_norm=norm), observation((64, 4))
+        with torch.no_grad():
+            policy.module[0].head.function[0].weight *= 100.0
+        shares[norm] = actor_saturation(policy, td)["actor_saturation"]
+    assert shares[False] > 0.5
+    assert shares[True] < 0.01
+
+
 def test_saturation_is_told_of_frames_all_over_a_large_batch():
     policy, td = actor(), observation((100, 6))
     seen = []

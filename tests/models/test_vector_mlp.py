@@ -41,9 +41,11 @@ def test_an_embedding_is_of_one_agents_observation_alone():
 @pytest.mark.parametrize("centralised", [False, True])
 def test_critics_are_benchmarls_one_mlp_of_everything_they_may_read(centralised):
     td, config = observation(), VectorMLPConfig([])
-    of_state = ValueConfig(widths=[8], pooling="concat", mlp=None, asymmetric=False, embedding_norm=False)
+    of_state = ValueConfig(
+        widths=[8], pooling="concat", mlp=None, asymmetric=False, embedding_norm=False, hidden_norm=False
+    )
     value = build_value(config, SIZES, of_state, centralised)
-    of_action = ActionValueConfig(widths=[8], mlp=None, asymmetric=False, embedding_norm=False)
+    of_action = ActionValueConfig(widths=[8], mlp=None, asymmetric=False, embedding_norm=False, hidden_norm=False)
     of_actions = build_action_value(config, SIZES, of_action, centralised)
     seen, acted = td[OBSERVATION], td["agents", "action"]
     if centralised:

@@ -31,12 +31,14 @@ class DeterministicActorConfig:
     Attributes:
         widths: hidden layers, each followed by tanh.
         embedding_norm: g_i is normalised before it enters the head (paper: no); see ``models.registry.Normalised``.
+        hidden_norm: what enters each tanh of the head is normalised (paper: no); see ``models.heads.feedforward``.
         relative_points: an oracle's actor is told the privileged points relative to each agent too.
         memory: None; PPO alone trains recurrent actors.
     """
 
     widths: list[int]
     embedding_norm: bool
+    hidden_norm: bool
     relative_points: bool
     memory: MemoryConfig | None
 
@@ -67,7 +69,9 @@ class DeterministicPolicy(TensorDictModuleBase):
         """Put the policy's head on an encoder; ``actions`` is A, the numbers in one agent's action."""
         super().__init__()
         self.in_keys, self.out_keys = input_keys(encoder, n_privileged), [entries.ACTION]
-        self.head = AgentHead(encoder, config.widths, actions, 0.01, n_privileged, n_points)
+        self.head = AgentHead(
+            encoder, config.widths, actions, 0.01, n_privileged, n_points, hidden_norm=config.hidden_norm
+        )
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write ``entries.ACTION``."""

@@ -20,6 +20,8 @@ NEUTRAL: dict[str, Any] = {
     "task.reward.lambda_fail": 0.0,
     "algo.actor.embedding_norm": False,
     "algo.critic.embedding_norm": False,
+    "algo.actor.hidden_norm": False,
+    "algo.critic.hidden_norm": False,
     "algo.actor.relative_points": False,
     "model.remember": False,
     "algo.actor.memory": None,

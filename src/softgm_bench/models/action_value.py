@@ -33,12 +33,14 @@ class ActionValueConfig:
         mlp: the critic's encoder is this MLP, whatever the actor's; None: the same model as the actor's.
         asymmetric: the head reads ``entries.PRIVILEGED`` too. Only training has a critic; execution does not need it.
         embedding_norm: the encoder's embedding is normalised (paper: no); see ``models.registry.Normalised``.
+        hidden_norm: what enters each tanh of the head is normalised (paper: no); see ``heads.feedforward``.
     """
 
     widths: list[int]
     mlp: MLPConfig | None
     asymmetric: bool
     embedding_norm: bool
+    hidden_norm: bool
 
 
 class AgentActionValue(TensorDictModuleBase):
@@ -50,7 +52,7 @@ class AgentActionValue(TensorDictModuleBase):
         self.in_keys, self.out_keys = [*input_keys(encoder, n_privileged), entries.ACTION], [ACTION_VALUE]
         self.encoder, self.n_privileged = encoder, n_privileged
         in_features = encoder.own_features + encoder.out_features + actions + n_privileged
-        self.function = feedforward(in_features, config.widths, 1, last_gain=1.0)
+        self.function = feedforward(in_features, config.widths, 1, 1.0, config.hidden_norm)
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write ``ACTION_VALUE``."""
@@ -68,7 +70,7 @@ class TeamActionValue(TensorDictModuleBase):
         super().__init__()
         self.in_keys, self.out_keys = [*input_keys(encoder, n_privileged), entries.ACTION], [ACTION_VALUE]
         self.encoder, self.n_agents, self.n_privileged = encoder, n_agents, n_privileged
-        self.function = feedforward(encoder.out_features, config.widths, 1, last_gain=1.0)
+        self.function = feedforward(encoder.out_features, config.widths, 1, 1.0, config.hidden_norm)
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write ``ACTION_VALUE``."""

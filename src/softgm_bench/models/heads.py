@@ -52,6 +52,7 @@ class ActorConfig:
         persistence: share p of the previous action in the pre-tanh mean, ``p atanh(a_{t-1}) + (1 - p) mu`` (paper: 0).
             Above 0, exploration is correlated in time: it moves a slow arm where independent noise only shakes it.
         embedding_norm: g_i is normalised before it enters the head (paper: no); see ``models.registry.Normalised``.
+        hidden_norm: what enters each tanh of the head is normalised (paper: no); see ``feedforward``.
         relative_points: an oracle's actor is told the privileged points relative to each agent too.
         memory: each agent remembers, by a recurrent cell before the head; None: it does not (paper).
     """
@@ -64,6 +65,7 @@ class ActorConfig:
     mean_bound: float
     persistence: float
     embedding_norm: bool
+    hidden_norm: bool
     relative_points: bool
     memory: MemoryConfig | None
 
@@ -96,6 +98,7 @@ class ValueConfig:
         mlp: the critic's encoder is this MLP, whatever the actor's; None: the same model as the actor's.
         asymmetric: the head reads ``entries.PRIVILEGED`` too. Only training has a critic; execution does not need it.
         embedding_norm: as the actor's, of the critic's own encoder.
+        hidden_norm: as the actor's.
     """
 
     widths: list[int]
@@ -103,6 +106,7 @@ class ValueConfig:
     mlp: MLPConfig | None
     asymmetric: bool
     embedding_norm: bool
+    hidden_norm: bool
 
     def __post_init__(self) -> None:
         """Refuse values that give no critic.
@@ -127,16 +131,24 @@ def privileged(td: TensorDictBase, n_privileged: int, like: Tensor) -> Tensor:
     return td.get(entries.PRIVILEGED) if n_privileged else like[..., 0, :0]
 
 
-def feedforward(in_features: int, widths: Sequence[int], out_features: int, last_gain: float) -> nn.Sequential:
-    """Linear layers with tanh between them, orthogonal weights (gain sqrt 2, the last ``last_gain``), zero biases."""
+def feedforward(
+    in_features: int, widths: Sequence[int], out_features: int, last_gain: float, norm: bool = False
+) -> nn.Sequential:
+    """Linear layers with tanh between them, orthogonal weights (gain sqrt 2, the last ``last_gain``), zero biases.
+
+    With ``norm`` a layer normalisation stands before every tanh: however far the weights grow, its input has mean 0 and
+    variance 1 over the layer's units, times a gain that is learnt, so that few of them can leave the range where the
+    tanh has a slope.
+    """
     sizes = [in_features, *widths, out_features]
     layers: list[nn.Module] = []
     for index, (fan_in, fan_out) in enumerate(itertools.pairwise(sizes)):
         linear = nn.Linear(fan_in, fan_out)
         nn.init.orthogonal_(linear.weight, last_gain if index == len(widths) else math.sqrt(2))
         nn.init.zeros_(linear.bias)
-        layers += [linear, Tanh()]
-    return nn.Sequential(*layers[:-1])
+        hidden = index < len(widths)
+        layers += [linear, *([nn.LayerNorm(fan_out)] if norm and hidden else []), *([Tanh()] if hidden else [])]
+    return nn.Sequential(*layers)
 
 
 class AgentHead(nn.Module):
@@ -159,6 +171,7 @@ class AgentHead(nn.Module):
         n_privileged: int = 0,
         n_points: int = 0,
         memory: MemoryConfig | None = None,
+        hidden_norm: bool = False,
     ) -> None:
         """Put f (hidden layers ``widths``, last layer scaled by ``last_gain``) on an encoder, which gives g_i.
 
@@ -171,7 +184,7 @@ class AgentHead(nn.Module):
         self.memory = None if memory is None else Memory(memory, in_features)
         in_features += 0 if memory is None else memory.size
         self.in_keys = input_keys(encoder, n_privileged) + ([] if self.memory is None else self.memory.in_keys)
-        self.function = feedforward(in_features, widths, out_features, last_gain)
+        self.function = feedforward(in_features, widths, out_features, last_gain, hidden_norm)
 
     def forward(self, td: TensorDictBase) -> Tensor:
         """``(..., N, out_features)``."""
@@ -210,7 +223,8 @@ def actor_saturation(policy: nn.Module, batch: TensorDictBase) -> dict[str, floa
     frames = torch.arange(count, device=batch.device) * batch.numel() // count
     chosen = (frames // batch.shape[1], frames % batch.shape[1])
     read = batch.select(*head.in_keys)[chosen]
-    size = head.function[0](head.inputs(read)).abs()
+    until = next(index for index, layer in enumerate(head.function) if isinstance(layer, Tanh))
+    size = head.function[:until](head.inputs(read)).abs()
     share, mean = torch.stack([(size > SATURATED).float().mean(), size.mean()]).tolist()
     return {"actor_saturation": share, "actor_preactivation": mean}
 
@@ -224,7 +238,9 @@ class GaussianPolicy(TensorDictModuleBase):
         """Put the policy's head on an encoder; ``actions`` is A, the numbers in one agent's action."""
         super().__init__()
         outputs = 2 * actions if config.state_dependent_sigma else actions
-        self.head = AgentHead(encoder, config.widths, outputs, 0.01, n_privileged, n_points, config.memory)
+        self.head = AgentHead(
+            encoder, config.widths, outputs, 0.01, n_privileged, n_points, config.memory, config.hidden_norm
+        )
         memory = self.head.memory
         self.in_keys, self.out_keys = self.head.in_keys, [LOC, SCALE, *([] if memory is None else memory.out_keys)]
         self.persistence = config.persistence
@@ -265,7 +281,7 @@ class TeamValue(TensorDictModuleBase):
         self.in_keys, self.out_keys = input_keys(encoder, n_privileged), [STATE_VALUE]
         self.encoder, self.n_privileged = encoder, n_privileged
         in_features = encoder.out_features + (n_privileged if isinstance(encoder, Encoder) else 0)
-        self.function = feedforward(in_features, config.widths, 1, last_gain=1.0)
+        self.function = feedforward(in_features, config.widths, 1, 1.0, config.hidden_norm)
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write ``STATE_VALUE``."""
@@ -283,7 +299,7 @@ class AgentValue(TensorDictModuleBase):
         """Put the critic's head on an encoder."""
         super().__init__()
         self.in_keys, self.out_keys = input_keys(encoder, n_privileged), [STATE_VALUE]
-        self.head = AgentHead(encoder, config.widths, 1, last_gain=1.0, n_privileged=n_privileged)
+        self.head = AgentHead(encoder, config.widths, 1, 1.0, n_privileged, hidden_norm=config.hidden_norm)
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write ``STATE_VALUE``."""
