@@ -40,11 +40,11 @@ def test_every_combination_of_files_is_valid(task, experiment):
 @pytest.mark.parametrize("recipe", ["paper", "tuned"])
 @pytest.mark.parametrize("algo", algorithm_configs())
 def test_every_algorithm_has_both_recipes(algo, recipe):
-    config = configure([f"algo={algo}", f"recipe={recipe}", "task=wall"])
+    config = configure([f"algo={algo}", f"recipe={recipe}", "task=structured"])
 
     assert type(config.algo) is algorithm_configs()[algo]
     assert config.algo.name == algo
-    assert config.run_dir == f"outputs/wall/{algo}/seed0"
+    assert config.run_dir == f"outputs/structured/{algo}/seed0"
     assert config.algo.gamma == {"paper": 0.99, "tuned": 0.95}[recipe]
     assert config.model.velocity_scale == {"paper": 1.0, "tuned": 0.2}[recipe]
 
@@ -55,6 +55,9 @@ def test_only_the_tuned_recipe_has_what_walls_need_and_only_on_walls():
             config = compose([f"task={task}", f"recipe={recipe}"])
             expected = recipe == "tuned" and task.startswith("wall")
             assert config.task.curriculum.enabled is config.algo.critic.asymmetric is expected
+            assert (config.experiment.num_envs, config.algo.minibatch_size, config.algo.gamma) == (
+                ((128, 800, 0.98) if expected else (512, 1280, 0.95)) if recipe == "tuned" else (128, 1600, 0.99)
+            )
 
 
 @pytest.mark.parametrize("recipe", ["paper", "tuned"])
@@ -155,7 +158,7 @@ def test_perturbations_are_the_papers_and_every_number_can_be_set():
 
 
 def test_a_training_episode_is_as_long_as_the_command_line_says_or_the_task_or_the_experiment():
-    for recipe, on_wall in (("tuned", 200), ("paper", 100)):
+    for recipe, on_wall in (("tuned", 60), ("paper", 100)):
         quick = [f"recipe={recipe}", "experiment=quick"]
         assert compose([*quick, "task=basic"]).experiment.train_horizon == 100
         assert compose([*quick, "task=wall"]).experiment.train_horizon == on_wall

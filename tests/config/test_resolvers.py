@@ -35,6 +35,12 @@ def test_a_value_depends_on_whether_the_critic_is_centralised():
     assert resolved("${if_centralised:1, 2}", algo={"name": "mine", "centralised": False}) == 2
 
 
+def test_a_value_depends_on_whether_the_task_hides_something():
+    assert resolved("${if_hidden:1, 2}", task={"name": "mine", "hidden_scene": True}) == 1
+    assert resolved("${if_hidden:1, 2}", task={"name": "mine", "hidden_scene": False}) == 2
+    assert resolved("${if_hidden:1, 2}", task={"name": "mine"}) == 2
+
+
 def test_a_value_depends_on_whether_the_experiment_is_a_smoke_run():
     assert resolved("${in_smoke:1, 2}", experiment={"name": "smoke"}) == 1
     assert resolved("${in_smoke:1, 2}", experiment={"total_frames": 7}) == 2

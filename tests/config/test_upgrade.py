@@ -61,7 +61,7 @@ def test_keys_that_there_were_not_have_values_that_change_nothing():
     config = typed(OmegaConf.create(before("task=wall")))
     assert (config.recipe, config.experiment.name, config.resume) == ("", "", False)
     assert (config.task.train_horizon, config.task.hidden_scene) == (None, False)
-    assert config.experiment.train_horizon == 200
+    assert config.experiment.train_horizon == 60
     assert config.task.curriculum.enabled is config.algo.critic.asymmetric is True
     assert config.algo.actor.embedding_norm is config.algo.critic.embedding_norm is False
 

@@ -29,6 +29,11 @@ def if_centralised(centralised: Any, independent: Any, *, _root_: DictConfig) ->
     return _node(centralised if OmegaConf.select(_root_, "algo.centralised") else independent)
 
 
+def if_hidden(hidden: Any, plain: Any, *, _root_: DictConfig) -> Any:
+    """The first value where something has to be found out (``task.hidden_scene``), the second elsewhere."""
+    return _node(hidden if OmegaConf.select(_root_, "task.hidden_scene") else plain)
+
+
 def in_smoke(smoke: Any, otherwise: Any, *, _root_: DictConfig) -> Any:
     """The first value with ``experiment=smoke``, the second with every other experiment."""
     return _node(smoke if OmegaConf.select(_root_, "experiment.name") == SMOKE else otherwise)
@@ -57,5 +62,5 @@ def _node(value: Any) -> Any:
 
 def register() -> None:
     """Let YAML call the functions above by their names."""
-    for resolver in (tuned_or_paper, on_or_off_policy, if_centralised, in_smoke, in_gpu, first, label):
+    for resolver in (tuned_or_paper, on_or_off_policy, if_centralised, if_hidden, in_smoke, in_gpu, first, label):
         OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)
