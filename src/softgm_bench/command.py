@@ -50,8 +50,8 @@ def _run(name: str, text: str | None, body: Callable[[list[str]], None], argumen
             raise
         print(f"softgm_bench.{name}: {explain(error, arguments)}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
-        print(f"softgm_bench.{name}: interrupted", file=sys.stderr)
+    except KeyboardInterrupt as interruption:
+        print(f"softgm_bench.{name}: {str(interruption) or 'interrupted'}", file=sys.stderr)
         return 130
     return 0
 

@@ -18,6 +18,7 @@ COMMANDS = {
     "replay": "a recorded episode again, in this simulator or in PyElastica",
     "report": "tables and figures of many runs",
     "status": "what has become of the runs in a folder",
+    "dataset": "transitions of a mix of policies, for offline learning",
     "certify": "which scenes of a task can be solved: actions that do",
     "export": "the policy of a run as one small file",
 }
@@ -70,4 +71,4 @@ def _settings(command: str) -> list[str]:
     name = f"softgm_bench.{command}"
     options = getattr(import_module(f"{name}.__main__" if command == "render" else name), "Options", None)
     own = [field.name for field in fields(options)] if options is not None else []
-    return own + (list(CHANGEABLE) if command in ("attention", "evaluate", "render") else [])
+    return own + (list(CHANGEABLE) if command in ("attention", "dataset", "evaluate", "render") else [])

@@ -74,6 +74,7 @@ class EpisodeRecords(Mapping[str, Values]):
 
 Show = Callable[[TensorDictBase], TensorDictBase]
 Watch = Callable[[int, int], None]  # told now and then: steps and ended episodes since it was told last
+Keep = Callable[[TensorDictBase, Tensor], None]  # given every step and its "next", (episodes,), and who still plays
 
 
 def evaluate(
@@ -85,10 +86,12 @@ def evaluate(
     gamma: float = DISCOUNT,
     show: Show | None = None,
     watch: Watch | None = None,
+    keep: Keep | None = None,
 ) -> EpisodeRecords:
     """One episode in each of ``env``'s environments; the same seed gives the same episodes.
 
-    ``show`` makes of a frame ``(episodes,)`` the one that the policy is shown in its place; ``watch`` follows.
+    ``show`` makes of a frame ``(episodes,)`` the one that the policy is shown in its place; ``watch`` follows, and
+    ``keep`` is handed every step, of which the rows count that the mask beside it names.
 
     Training is not disturbed: ``env`` must not be the training environment, and the global generator, on which a
     policy that samples draws, is put back.
@@ -101,7 +104,7 @@ def evaluate(
     with torch.random.fork_rng(devices), torch.no_grad(), set_exploration_type(exploration):
         env.set_seed(seed)
         torch.manual_seed(seed)
-        return _first_episodes(policy, env, gamma, show, watch)
+        return _first_episodes(policy, env, gamma, show, watch, keep)
 
 
 def evaluate_in_parts(
@@ -157,7 +160,12 @@ def evaluation_seed(seed: int, part: int = 0) -> int:
 
 
 def _first_episodes(
-    policy: TensorDictModuleBase, env: EnvBase, gamma: float, show: Show | None, watch: Watch | None
+    policy: TensorDictModuleBase,
+    env: EnvBase,
+    gamma: float,
+    show: Show | None,
+    watch: Watch | None,
+    keep: Keep | None,
 ) -> EpisodeRecords:
     data = env.reset()
     alive = torch.ones(env.batch_size, dtype=torch.bool, device=env.device)
@@ -177,6 +185,8 @@ def _first_episodes(
         sound = sound & chosen[entries.ACTION].isfinite().all()
         data = env.step(chosen)
         after = data["next"]
+        if keep is not None:
+            keep(data, alive)
         tally = tally or _Tally(after, gamma)
         tally.add(after, alive)
         alive = alive & ~after[entries.DONE].squeeze(-1)
