@@ -61,6 +61,7 @@ PUBLIC = {
         "episodes.trajectory",
         "episodes.replay",
     ],
+    "datasets": ["datasets.reading", "datasets.layout", "datasets.minari"],
     "render": ["render.still", "render.video", "render.html"],
     "adapters": ["adapters.pettingzoo", "adapters.player", "adapters.gymnasium_vector"],
 }

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from softgm_bench import certify, command
+from softgm_bench import certify, command, dataset
 from softgm_bench.config import compose
 from softgm_bench.console import COMMANDS
 from softgm_bench.sweeps import launch
@@ -62,10 +62,11 @@ def test_every_documented_command_can_be_read(name, arguments):
     if name == "export":
         assert len(arguments) == 2
         return
-    if name == "certify":
-        options, overrides = command.split(arguments, certify.Options, others=True)
+    if name in ("certify", "dataset"):
+        kind = certify if name == "certify" else dataset
+        options, overrides = command.split(arguments, kind.Options, others=True)
         options.check()
-        assert any(override.startswith("task=") for override in overrides)
+        assert name == "dataset" or any(override.startswith("task=") for override in overrides)
         return
     module = import_module("softgm_bench.render.__main__" if name == "render" else f"softgm_bench.{name}")
     path, options, overrides = command.parse(
@@ -92,6 +93,7 @@ SMALL = {
     "render": ["horizon=40", "threads=1", "width=64", "height=48"],
     "report": ["resamples=100"],
     "certify": ["episodes=4", "minutes=0.1"],
+    "dataset": ["transitions=20", "horizon=4", "batch=2"],
 }
 
 

@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
 from softgm_bench.assembly import configure
-from softgm_bench.config import Config, plain
+from softgm_bench.config import Config, plain, validate_device
 from softgm_bench.envs import entries, kind_of
 from softgm_bench.episodes import policy
 from softgm_bench.errors import UserError
@@ -68,6 +68,7 @@ def load(
     Raises:
         UserError: a source makes no sense, the policies do not act in the same, or nothing says on which task.
     """
+    validate_device(device)
     trained = {source: policy.load(Path(source), device, overrides) for source in sources if source != RANDOM}
     named = next((source for source in sources if source != RANDOM), None)
     if named is not None:
