@@ -45,3 +45,5 @@ def test_policies_act_in_the_same_or_are_refused():
     assert [one.about["label"] for one in behaviours] == ["softgm", "random", "softgm"]
     with pytest.raises(UserError, match="name a task too"):
         mixture.load(["random"], [1], 10, "cpu", [])
+    with pytest.raises(UserError, match=f"transitions=10: {basic} would have none"):
+        mixture.load(["random", basic], [1000, 1], 10, "cpu", ["task=basic"])

@@ -73,6 +73,15 @@ def test_slices_are_consecutive_steps_of_an_episode(wall):
     assert split.shape == (10, 4)
 
 
+def test_a_single_episode_has_slices_too(tmp_path):
+    write(tmp_path / "x", Asked(["random"], ["task=basic"], transitions=3, batch=1))
+    data = load(tmp_path / "x")
+    assert len(data.episodes["length"]) == 1
+    index = data.replay_buffer(60, slice_length=3).sample()["index"].reshape(-1, 3)
+    assert (index.diff(dim=1) == 1).all()
+    assert set(index[:, 0].tolist()) == set(range(data.transitions - 2))
+
+
 def test_one_policy_of_the_mixture_can_be_taken_alone(wall):
     data = load(wall)
     counts = [len(data.storage(policy=number)) for number in range(2)]

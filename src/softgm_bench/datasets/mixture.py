@@ -82,6 +82,9 @@ def load(
             raise UserError(f"{source} acts in another {differs} than {named}: add {differs}=NAME for both")
     sizes = kind_of(config.task).sizes(config.task)
     counts = _apportioned(shares, transitions)
+    if 0 in counts:
+        none = sources[counts.index(0)]
+        raise UserError(f"transitions={transitions}: {none} would have none; ask for more or give it a larger share")
     behaviours = []
     for source, share, count in zip(sources, shares, counts, strict=True):
         about: dict[str, Any] = {"source": source, "share": share / sum(shares), "transitions": count}

@@ -99,7 +99,7 @@ class Dataset:
         storage = self.storage(policy, reward_terms)
         sampler: Any = RandomSampler()
         if slice_length is not None:
-            sampler = SliceSampler(slice_len=slice_length, trajectories=storage.trajectories(), cache_values=True)
+            sampler = SliceSampler(slice_len=slice_length, ends=storage.ends(), cache_values=True)
         fixed = {"sampler": sampler, "writer": ImmutableDatasetWriter(), "collate_fn": _as_it_is}
         return TensorDictReplayBuffer(storage=storage, batch_size=batch_size, **fixed, **settings)
 
@@ -138,7 +138,6 @@ class TransitionStorage(Storage):
         self._ends = length.cumsum(0)
         self._begin = torch.from_numpy(dataset.episodes["begin"][episodes].astype(np.int64)) - (self._ends - length)
         self._chunk = torch.from_numpy(dataset.episodes["chunk"][episodes].astype(np.int64))
-        self._length = length
         self._files = writing.written(dataset.folder)
         self._mapped: dict[int, tuple[TensorDict, Tensor]] = {}
 
@@ -146,9 +145,11 @@ class TransitionStorage(Storage):
         """Number of transitions."""
         return self.max_size
 
-    def trajectories(self) -> Tensor:
-        """Give the number of its episode for every transition, as ``SliceSampler`` takes it, ``(transitions,)``."""
-        return torch.arange(len(self._length)).repeat_interleave(self._length)
+    def ends(self) -> Tensor:
+        """Tell of every transition, ``(transitions,)``, whether it is its episode's last, for a ``SliceSampler``."""
+        ends = torch.zeros(len(self), dtype=torch.bool)
+        ends[self._ends - 1] = True
+        return ends
 
     def get(self, index: Any) -> TensorDict:
         """Give one transition, or as many as ``index`` (a slice, a list, a tensor ``(size,)``) asks for."""
@@ -164,7 +165,7 @@ class TransitionStorage(Storage):
             raise IndexError(f"a data set of {len(self)} transitions has no such index")
         episode = torch.searchsorted(self._ends, index, right=True)
         chunk, row = self._chunk[episode], self._begin[episode] + index
-        numbers = chunk.unique().tolist()
+        numbers = chunk.unique().tolist() or [0]
         if len(numbers) == 1:
             return self._transitions(numbers[0], row)
         asked = [(chunk == number).nonzero().squeeze(-1) for number in numbers]

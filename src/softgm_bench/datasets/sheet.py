@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softgm_bench.datasets import chunks, layout, writing
+from softgm_bench.datasets.mixture import OF_TRAINING
 from softgm_bench.envs import Sizes, entries
 from softgm_bench.episodes.evaluation import EpisodeRecords
 from softgm_bench.episodes.summary import summarise
@@ -84,9 +85,7 @@ def settings_table(settings: Mapping[str, Any]) -> str:
     """Everything that decides what an episode is, as Markdown."""
     rows = ["| setting | value |", "| --- | --- |"]
     for key in ("task", "rod", "perturbation", "dtype"):
-        value = settings["config"][key]
-        for name, inner in sorted(value.items()) if isinstance(value, Mapping) else [("", value)]:
-            rows.append(f"| `{key}{'.' * bool(name)}{name}` | {inner} |")
+        rows += [f"| `{name}` | {value} |" for name, value in _single(key, settings["config"][key])]
     rows += [f"| `{key}` | {settings[key]} |" for key in ("backend", "device", "horizon")]
     return "\n".join(rows)
 
@@ -111,6 +110,14 @@ def entries_table(folder: Path) -> str:
             size = value.element_size() * value.shape[1:].numel()
             rows.append(f"| `{part}` | `{name}` | ({shape}) | {str(value.dtype).removeprefix('torch.')} | {size} |")
     return "\n".join(rows)
+
+
+def _single(key: str, value: Any) -> list[tuple[str, Any]]:
+    """Give single settings by dotted key, without those of training alone."""
+    if not isinstance(value, Mapping):
+        return [(key, value)]
+    inner = [(name, value[name]) for name in sorted(value) if name not in OF_TRAINING]
+    return [pair for name, held in inner for pair in _single(f"{key}.{name}", held)]
 
 
 _OWN = (layout.EPISODE, layout.POLICY, layout.FINAL)
