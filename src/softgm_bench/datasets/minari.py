@@ -45,10 +45,7 @@ def export(data: Dataset, dataset_id: str) -> Any:
             if key[0] != "next" and key not in (entries.ACTION, layout.EPISODE, layout.POLICY) and value.numel()
         }
         if action is None:
-            bounds = {name: (0, 1) if values.dtype == np.uint8 else (-np.inf, np.inf) for name, values in shown.items()}
-            observation = spaces.Dict(
-                {name: spaces.Box(*bounds[name], values.shape[1:], values.dtype) for name, values in shown.items()}
-            )
+            observation = spaces.Dict({name: _space(spaces, values) for name, values in shown.items()})
             action = spaces.Box(-1.0, 1.0, steps[entries.ACTION].shape[1:], np.float32)
         buffers.append(
             EpisodeBuffer(
@@ -70,6 +67,12 @@ def export(data: Dataset, dataset_id: str) -> Any:
         )
     except ValueError as error:
         raise UserError(f"{dataset_id}: {error}") from error
+
+
+def _space(spaces: Any, values: NDArray[Any]) -> Any:
+    """Give the space of an entry ``(steps, ...)``: flags are 0 or 1, other numbers any."""
+    low, high = (0, 1) if values.dtype == np.uint8 else (-np.inf, np.inf)
+    return spaces.Box(low, high, values.shape[1:], dtype=values.dtype)
 
 
 def _numbers(values: Tensor) -> NDArray[Any]:
