@@ -40,7 +40,6 @@ ORIGINAL = "softgm"
 CLONES: dict[str, tuple[list[str], int | None]] = {
     "mlp_of_softgm": (["algo=ippo"], 2),
     "mlp_of_all": (["algo=ippo"], None),
-    "softgm_of_softgm": (["algo=softgm"], 2),
 }
 STEPS, BATCH, LEARNING_RATE = 500, 256, 2e-3
 PROTOCOL = Protocol(episodes=100, horizon=200)
