@@ -1,6 +1,7 @@
 """Small data sets for tests, and everything that their environments showed, kept as it came."""
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -12,7 +13,7 @@ from softgm_bench.datasets import mixture, sheet, writing
 from softgm_bench.envs import kind_of
 from softgm_bench.episodes.evaluation import evaluate
 
-POLICY = "experiments/policies/{task}_softgm.pt"
+POLICY = str(Path(__file__).parents[2] / "experiments/policies/{task}_softgm.pt")
 
 
 @dataclass
