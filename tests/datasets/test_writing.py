@@ -74,6 +74,16 @@ def test_the_last_bits_of_an_unfinished_one_are_not_mixed(whole, tmp_path):
         writing.begin(tmp_path / "x", settings | {"threads": 2})
 
 
+def test_what_is_acted_in_must_be_the_same_but_a_later_version_may_have_more_settings(whole):
+    _, _, settings = ASKED.load()
+    config = settings["config"]
+    more = config | {"algo": None, "task": config["task"] | {"added": 0}}
+    assert writing.begin(whole, settings | {"config": more})
+    for other in ({"dtype": "float32"}, {"task": config["task"] | {"success_radius": 0.1}}):
+        with pytest.raises(UserError, match="holds a data set with another config"):
+            writing.begin(whole, settings | {"config": config | other})
+
+
 def test_a_folder_with_something_else_is_left_alone(tmp_path):
     _, _, settings = ASKED.load()
     (tmp_path / "notes.txt").touch()

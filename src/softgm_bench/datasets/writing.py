@@ -39,7 +39,7 @@ def begin(folder: Path, settings: Mapping[str, Any]) -> bool:
     if file.exists():
         held, finished = read_settings(folder), (folder / SUMS).exists()
         left_out = TOLD + (MADE_WITH if finished else ())
-        differs = next((key for key in wanted if key not in left_out and held.get(key) != wanted[key]), None)
+        differs = next((key for key in wanted if key not in left_out and not _alike(key, held, wanted)), None)
         if differs is not None:
             raise UserError(f"out={folder} holds a data set with {_told(differs, held, wanted)}: choose another folder")
         chunks.sweep(folder)
@@ -188,6 +188,20 @@ def _chunk(
         episodes += len(parts[-1][layout.EPISODES])
         part += 1
     return layout.joined(parts)
+
+
+def _alike(key: str, held: Mapping[str, Any], wanted: Mapping[str, Any]) -> bool:
+    """Tell whether a setting is the same; of the configuration what is acted in, since fingerprints tell policies."""
+    if key != "config":
+        return held.get(key) == wanted[key]
+    return all(_holds(held[key].get(name), wanted[key][name]) for name in ("task", "rod", "perturbation", "dtype"))
+
+
+def _holds(held: Any, wanted: Any) -> bool:
+    """Compare settings, of which a later version may have more; those stand for what was always done."""
+    if isinstance(held, Mapping) and isinstance(wanted, Mapping):
+        return all(_holds(value, wanted.get(name)) for name, value in held.items())
+    return held == wanted
 
 
 def _told(key: str, held: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
