@@ -33,10 +33,9 @@ A soft robotic arm whose sections learn to reach targets together: train, evalua
 Commands:
 {commands}
 
-softgm-bench COMMAND --help lists a command's settings; they are written key=value and have
-defaults. A mistake is answered by one line that says what would be right. Ctrl-C leaves a run
-that resume=true resumes. Without a command's name, softgm-bench trains, as does
-python -m softgm_bench; python -m softgm_bench.evaluate and so on are the other commands.
+softgm-bench COMMAND --help lists a command's settings, written key=value, and their defaults.
+A mistake is answered by one line that says what would be right. Ctrl-C leaves a run that
+resume=true resumes. Without a command softgm-bench trains, as python -m softgm_bench does.
 
 In Python: softgm_bench.train, load, evaluate, make_env. --version prints the version.
 Completion in bash, for zsh and fish likewise: eval "$(softgm-bench -sc install=bash)"
