@@ -7,6 +7,8 @@ from tensordict import TensorDict
 from softgm_bench.envs import entries
 from softgm_bench.envs.interface import Sizes
 from softgm_bench.models import ActorConfig, SoftGMConfig, ValueConfig
+from softgm_bench.models.informarl import InforMARLConfig
+from softgm_bench.models.section_transformer import SectionTransformerConfig
 
 SEEDS = strategies.integers(0, 2**31)
 COUNTS = strategies.tuples(strategies.integers(1, 5), strategies.integers(0, 6))  # N, M
@@ -56,6 +58,34 @@ def softgm_config(**changes):
         "remember": False,
     }
     return SoftGMConfig(**(values | changes))
+
+
+def informarl_config(**changes):
+    values = {
+        "name": "informarl",
+        "hidden": 8,
+        "heads": 2,
+        "layers": 2,
+        "type_embedding": 3,
+        "embedding_layers": 2,
+        "velocity_scale": 1.0,
+        "remember": False,
+    }
+    return InforMARLConfig(**(values | changes))
+
+
+def transformer_config(**changes):
+    values = {
+        "name": "section_transformer",
+        "hidden": 8,
+        "heads": 2,
+        "layers": 2,
+        "feedforward": 12,
+        "velocity_scale": 1.0,
+        "remember": False,
+        "everyone": False,
+    }
+    return SectionTransformerConfig(**(values | changes))
 
 
 def actor_config(**changes):

@@ -36,9 +36,9 @@ def aggregate(values, weights, n_agents, out):
                 for channel in range(n_channels):
                     new[channel] = weights[1, row, head] * own[channel]
                 if agent > 0:
-                    _add(weights[0, row, head], values[row - 1, start:stop], new)
+                    add_scaled(weights[0, row, head], values[row - 1, start:stop], new)
                 if agent < n_agents - 1:
-                    _add(weights[2, row, head], values[row + 1, start:stop], new)
+                    add_scaled(weights[2, row, head], values[row + 1, start:stop], new)
 
 
 @njit(parallel=True, error_model="numpy", fastmath=FAST)
@@ -56,18 +56,20 @@ def differentiate(values, weights, gradient, n_agents, of_values, of_weights):
                 start, stop = head * n_channels, (head + 1) * n_channels
                 new = gradient[row, start:stop]
                 for step in range(max(agent - 1, 0) - agent, min(agent + 1, n_agents - 1) - agent + 1):
-                    _add(weights[step + 1, row, head], new, of_values[row + step, start:stop])
-                    of_weights[step + 1, row, head] = _dot(new, values[row + step, start:stop])
+                    add_scaled(weights[step + 1, row, head], new, of_values[row + step, start:stop])
+                    of_weights[step + 1, row, head] = dot(new, values[row + step, start:stop])
 
 
 @numba.njit(inline="always", error_model="numpy", fastmath=FAST)
-def _add(factor, source, target):
+def add_scaled(factor, source, target):
+    """Add ``factor * source`` to ``target``, arrays of one length."""
     for index in range(source.size):
         target[index] += factor * source[index]
 
 
 @numba.njit(inline="always", error_model="numpy", fastmath=FAST)
-def _dot(one, other):
+def dot(one, other):
+    """Give the scalar product of two arrays of one length."""
     total = one.dtype.type(0.0)
     for index in range(one.size):
         total += one[index] * other[index]

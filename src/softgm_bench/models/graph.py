@@ -138,7 +138,7 @@ def without_empty_slots(td: TensorDictBase) -> TensorDictBase:
     Where that many are, is read from the tensors: not for devices that must not be waited for.
     """
     active = td[entries.SLOT_ACTIVE]
-    used = active.flatten(0, -2).any(0).nonzero()
+    used = active.unsqueeze(0).flatten(0, -2).any(0).nonzero()
     count = int(used[-1]) + 1 if len(used) else 0
     cropped = td.select(entries.TIP, entries.TARGET)
     cropped[entries.EDGE] = td[entries.EDGE][..., :count]
