@@ -60,7 +60,7 @@ def test_mistakes_are_one_line(run, tmp_path):
     trajectory.save(watched(*SEEN), tmp_path / "episode.npz")
     trajectory.save(dataclasses.replace(watched(*SEEN), attention={}), tmp_path / "blind.npz")
     mistakes = {
-        ("mlp.pt",): "mlp.pt: its model has no attention; name a policy",
+        ("mlp.pt",): "mlp.pt: its model has no attention of two stages; name a policy",
         ("blind.npz",): "blind.npz: this episode has no attention; record one",
         ("episode.npz", "seed=1"): "seed=1: episode.npz is recorded already",
         ("episode.npz", "task=wall"): "task=wall: episode.npz is recorded already",

@@ -16,6 +16,7 @@ BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
     [
         ("env", ["--sizes", "2", "--repetitions", "1"]),
         ("models", ["--batch", "8", "--threads", "1"]),
+        ("rivals", ["--frames", "8", "--tasks", "basic"]),
         ("training", ["--algorithms", "mappo", "--tasks", "basic", "--repetitions", "1", "--threads", "1"]),
     ],
 )

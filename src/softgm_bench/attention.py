@@ -1,7 +1,7 @@
 """Draw where a policy looks: ``softgm-bench attention SOURCE [key=value ...]``.
 
 SOURCE is a run folder, a checkpoint or a policy's file, of which an episode is recorded, or an episode that was
-recorded with attention (.npz). The encoder must have attention, as SoftGM's has.
+recorded with attention (.npz). The encoder must have attention in two stages, as SoftGM's has.
 
   seed=0 episode=0       which episode of an evaluation is recorded; a policy's alone, as the next four
   episodes=null          of that evaluation: its size belongs to the seed; null: episode + 1
@@ -88,7 +88,9 @@ def _episode(source: Path, options: Options, overrides: list[str]) -> "Trajector
 
     trained = policy.load(source, overrides=overrides)
     if attention_encoder(trained.policy) is None:
-        raise UserError(f"{source}: its model has no attention; name a policy that was trained with model=softgm")
+        raise UserError(
+            f"{source}: its model has no attention of two stages; name a policy that was trained with model=softgm"
+        )
     set_threads(options.threads)  # as an evaluation does: rounding depends on it
     with Progress("recording", None, "steps") as progress:
         return record(

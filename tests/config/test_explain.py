@@ -27,7 +27,9 @@ def test_unknown_choices_list_the_known_ones():
     tasks = f"basic, structured, vmas_balance, vmas_navigation, {walls}"
     assert refusal("task=wal") == f"task=wal: no such task; choose one of {tasks}"
     assert refusal("experiment=fast") == "experiment=fast: no such experiment; choose one of default, gpu, quick, smoke"
-    models = "mlp, softgm, softgm_no_stage1, softgm_no_stage2, softgm_remember, vector_mlp"
+    transformers = "section_transformer, section_transformer_all, section_transformer_remember"
+    softgm = "softgm, softgm_no_stage1, softgm_no_stage2, softgm_remember"
+    models = f"informarl, informarl_remember, mlp, {transformers}, {softgm}, vector_mlp"
     assert refusal("model=cnn") == f"model=cnn: no such model; choose one of {models}"
     algorithms = ", ".join(sorted(algorithm_configs()))
     assert refusal("algo=ppo") == f"algo=ppo: no such algo; choose one of {algorithms}"

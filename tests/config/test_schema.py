@@ -14,6 +14,8 @@ def test_another_model_than_an_algorithms_own_is_named_in_folder_and_label():
         ("softgm", "softgm_remember", "softgm_remember"),
         ("masac", "softgm_no_stage2", "masac_softgm_no_stage2"),
         ("softgm", "mlp", "softgm_mlp"),
+        ("softgm", "informarl", "softgm_informarl"),
+        ("mappo", "section_transformer_all", "mappo_section_transformer_all"),
         ("masac", "mlp", "masac"),
         ("masac", "softgm", "masac_softgm"),
     ):

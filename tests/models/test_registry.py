@@ -12,14 +12,19 @@ from softgm_bench.models import (
     build_encoder,
     model_configs,
 )
+from softgm_bench.models.informarl import InforMARLConfig
 from softgm_bench.models.registry import register_model
+from softgm_bench.models.section_transformer import SectionTransformerConfig
 
 
 def test_the_configuration_chooses_the_encoder():
     assert isinstance(build_encoder(softgm_config(), SIZES), SoftGMEncoder)
     assert isinstance(build_encoder(MLPConfig(hidden=8, layers=1, velocity_scale=1.0), SIZES), MLPEncoder)
     softgm = dict.fromkeys(("softgm", "softgm_no_stage1", "softgm_no_stage2", "softgm_remember"), SoftGMConfig)
-    assert model_configs() == softgm | {"mlp": MLPConfig, "vector_mlp": VectorMLPConfig}
+    informarl = dict.fromkeys(("informarl", "informarl_remember"), InforMARLConfig)
+    transformer = [f"section_transformer{which}" for which in ("", "_all", "_remember")]
+    others = {"mlp": MLPConfig, "vector_mlp": VectorMLPConfig}
+    assert model_configs() == softgm | informarl | dict.fromkeys(transformer, SectionTransformerConfig) | others
 
 
 def test_a_configuration_of_no_model_is_refused():

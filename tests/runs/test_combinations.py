@@ -23,7 +23,12 @@ TASKS = tuple(task for task in every_task.TASKS if task not in FELT)
 ALGORITHMS = tuple(algorithm_configs())
 ON_POLICY = ("softgm", "ippo", "mappo")
 ABLATIONS = ("softgm_no_stage1", "softgm_no_stage2", "softgm_remember")  # models of SoftGM's algorithm
-PAIRS = [*product(ALGORITHMS, ("mlp", "softgm")), *product(("softgm",), ABLATIONS)]
+RIVALS = ("informarl", "section_transformer")
+PAIRS = [
+    *product(ALGORITHMS, ("mlp", "softgm")),
+    *product(("softgm",), (*ABLATIONS, *RIVALS)),
+    *product(("masac", "iddpg"), RIVALS),
+]
 OWN = {algo: "softgm" if algo == "softgm" else "mlp" for algo in ALGORITHMS}
 TINY = (
     "experiment=smoke",
@@ -69,7 +74,7 @@ def check_run(folder, algo, *overrides):
     return summary
 
 
-@pytest.mark.parametrize(("algo", "model", "task"), pairwise(ALGORITHMS, ("mlp", "softgm"), TASKS))
+@pytest.mark.parametrize(("algo", "model", "task"), pairwise(ALGORITHMS, ("mlp", "softgm", *RIVALS), TASKS))
 def test_every_algorithm_trains_with_every_model_on_every_task(tmp_path, algo, model, task):
     summary = check_run(tmp_path, algo, f"task={task}", f"model={model}")
     assert (summary["model"], summary["algo"]) == (model, algo if model == OWN[algo] else f"{algo}_{model}")
@@ -93,6 +98,19 @@ def test_ablations_train_on_every_task_under_their_own_names(tmp_path, model, ta
 @pytest.mark.parametrize(("algo", "model"), [*OWN.items(), *product(("softgm",), ABLATIONS)])
 def test_every_algorithm_trains_with_an_asymmetric_critic(tmp_path, algo, model):
     check_run(tmp_path, algo, "task=wall", f"model={model}", "algo.critic.asymmetric=true")
+
+
+@pytest.mark.parametrize("model", RIVALS)
+def test_rivals_train_with_everything_that_an_actor_may_have(tmp_path, model):
+    more = ("algo.actor.embedding_norm=true", "algo.critic.embedding_norm=true", "algo.actor.memory={cell:gru,size:8}")
+    summary = check_run(tmp_path, "softgm", "task=wall", f"model={model}", "task.n_agents=5", "recipe=paper", *more)
+    assert summary["algo"] == f"softgm_{model}_gru"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["informarl_remember", "section_transformer_remember", "section_transformer_all"])
+def test_rivals_of_other_kinds_train_under_their_own_names(tmp_path, model):
+    assert check_run(tmp_path, "softgm", "task=wall", f"model={model}")["algo"] == f"softgm_{model}"
 
 
 @pytest.fixture(scope="module")
@@ -164,7 +182,7 @@ def test_an_oracles_policy_reads_the_opening_in_either_recipe(algo, model, wall)
 @pytest.mark.parametrize("moved", [0, 3, 5])
 @pytest.mark.parametrize(("algo", "model"), PAIRS)
 def test_execution_is_decentralised(algo, model, moved, wall):
-    """An agent acts on its own entries and, with SoftGM, on those of agents at most L = 2 places away."""
+    """An agent acts on its own entries and, with graph networks, on those of agents at most L = 2 places away."""
     policy, td = built(algo, model, wall).policy.double(), scene(wall)
     td = td.select(*entries.OBSERVATION).apply(lambda entry: entry.double() if entry.is_floating_point() else entry)
     other = td.clone()
@@ -172,5 +190,5 @@ def test_execution_is_decentralised(algo, model, moved, wall):
         other[key][:, moved] = td[key][:, moved] * 0.5 + 0.1
     other[entries.EDGE][:, moved] = td[entries.SLOT_ACTIVE] & ~td[entries.EDGE][:, moved]
     changed = ((act(policy, td) - act(policy, other)).abs() > 1e-11).any(dim=-1).any(dim=0).tolist()
-    reach = 2 if model in ("softgm", "softgm_no_stage1", "softgm_remember") else 0
+    reach = 0 if model in ("mlp", "softgm_no_stage2") else 2
     assert changed == [abs(agent - moved) <= reach for agent in range(6)]

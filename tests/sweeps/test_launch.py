@@ -95,6 +95,17 @@ def test_the_ladder_goes_from_blind_to_told_and_shares_the_wholes_runs():
     assert [str(cell.run_dir) for cell in recurrent] == [f"outputs/full/{task}/softgm_gru/seed1" for task in tasks]
 
 
+@pytest.mark.parametrize("size", ["", "_smoke"])
+def test_the_rivals_differ_in_the_model_alone_and_share_softgms_runs_with_the_ladder(size):
+    cells = sweep.cells([f"+grids=rivals{size}"])[0]
+    assert len(cells) == 27
+    names = [str(cell.run_dir.parent.name) for cell in cells if "wall_touch" in str(cell.run_dir)]
+    assert sorted(set(names)) == ["softgm", "softgm_informarl", "softgm_section_transformer"]
+    if not size:
+        softgm = {cell.run_dir for cell in cells if cell.run_dir.parent.name == "softgm"}
+        assert softgm < {cell.run_dir for cell in sweep.cells(["+grids=ladder"])[0]}
+
+
 def test_table_one_has_every_algorithm_task_and_seed():
     params = OmegaConf.load(config_directory() / "grids" / "table1.yaml").hydra.sweeper.params
     assert sorted(params.algo.split(",")) == ["iddpg", "ippo", "isac", "maddpg", "mappo", "masac", "softgm"]

@@ -13,10 +13,21 @@ CONDITION_TITLES = {
 }
 
 
+# Models that are methods of their own. Trained by the algorithm named softgm, they are what is compared with SoftGM.
+RIVALS = {
+    "informarl": "InforMARL",
+    "section_transformer_all": "All-section transformer",
+    "section_transformer": "Section transformer",
+}
+
+
 def algorithm(label: str) -> str:
-    """Name an algorithm, e.g. ``SoftGM without stage 1`` or ``MAPPO, softgm``."""
+    """Name an algorithm, e.g. ``SoftGM without stage 1``, ``MAPPO, softgm`` or ``InforMARL``."""
     base, _, rest = label.partition("_")
     name = "SoftGM" if base == "softgm" else base.upper()
+    rival = next((model for model in RIVALS if rest.startswith(model)), None)
+    if base == "softgm" and rival is not None:
+        name, rest = RIVALS[rival], rest.removeprefix(rival).removeprefix("_")
     for stage in ("1", "2"):
         if rest.startswith(f"no_stage{stage}"):
             name += f" without stage {stage}"

@@ -27,6 +27,8 @@ COLOURS = {
     "softgm_no_stage1": "#7b6fd0",
     "softgm_no_stage2": "#9c8412",
     "softgm_remember": "#8c2d04",
+    "softgm_informarl": "#3b7f8c",
+    "softgm_section_transformer": "#b8860b",
 }
 DASHED = {"ippo", "iddpg", "isac"}
 OTHERS = ("#8a6d3b", "#6b7f2a", "#4a6f8a", "#8f5b5b", "#5f5f9e")

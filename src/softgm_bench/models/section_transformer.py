@@ -138,7 +138,7 @@ class SectionTransformerEncoder(Encoder):
 def _block(
     block: nn.TransformerEncoderLayer, sections: Tensor, bins: Tensor, hearing: Hearing, *, last: bool
 ) -> tuple[Tensor, Tensor, Heard]:
-    """Give new sections ``(T, hidden)``, bins ``(K, hidden)`` (the ``last`` block: the old ones), and what was heard."""
+    """Give new sections ``(T, hidden)``, bins ``(K, hidden)``, old ones in the ``last`` block, and what was heard."""
     attention = block.self_attn
     weight, bias, hidden = attention.in_proj_weight, attention.in_proj_bias, attention.embed_dim
     shape = (attention.num_heads, attention.head_dim)
