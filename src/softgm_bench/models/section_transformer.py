@@ -11,8 +11,8 @@ Amorpheus's residual connection from node features to decoder. What differs:
   limbs attend to all, which ``everyone`` allows to sections (``section_transformer_all``); that is one controller of
   the whole arm, which no other model here is.
 - Amorpheus has no obstacles, hence no bins, and no types.
-- blocks are normalised before instead of after, Amorpheus's torch default; inputs are not multiplied by sqrt(width);
-  no dropout. 64 channels, 4 heads, 2 blocks and 128 hidden units instead of 128, 2, 3 and 256: SoftGM's cost.
+- blocks are normalised before instead of after, Amorpheus's torch default; inputs are not multiplied by sqrt(width).
+  64 channels, 4 heads, 2 blocks and 128 hidden units instead of 128, 2, 3 and 256: SoftGM's cost.
 - one body and one task at a time with this package's algorithms and heads, tanh networks; Amorpheus trains one TD3 on
   many bodies with a linear decoder.
 
