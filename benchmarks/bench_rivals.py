@@ -80,7 +80,8 @@ def measure(task: str, td: TensorDictBase, sizes: Any) -> list[dict[str, Any]]:
         with counter:
             forward()
         counted = counter.get_total_flops() + loops(name, config, td)
-        seconds = [1.0 / best_rate(work, len(td), 1.0, repetitions=4, clock=time.process_time) for work in (forward, both)]
+        rates = [best_rate(work, len(td), 1.0, 4, time.process_time) for work in (forward, both)]
+        seconds = [1.0 / rate for rate in rates]
         rows.append(
             {
                 "task": task,
