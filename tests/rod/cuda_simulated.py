@@ -134,6 +134,32 @@ def test_contact_acts_as_in_the_torch_backend(scene, friction, model):
     assert_close(CudaBackend(parameters).control_step(state, couple, cylinders=cylinders), expected)
 
 
+@pytest.mark.parametrize("model", ["pyelastica", "exact"])
+@pytest.mark.parametrize("friction", [{}, FRICTION], ids=["smooth", "rough"])
+@pytest.mark.parametrize("scene", ["posts on both sides", "a wall of forty posts", "a slanted post's end"])
+def test_cylinders_that_move_act_as_in_the_torch_backend(scene, friction, model):
+    parameters = arm(**friction, contact_model=model, substeps=15)
+    state, couple = moving(parameters), couple_like(parameters, 1)
+    cylinders = SCENES[scene](state)
+    velocity = torch.tensor([-0.4, 0.3, 0.2]) * torch.arange(cylinders.mask.shape[1]).sub(1.5).sign()[None, :, None]
+    given = {"cylinders": cylinders, "cylinder_velocity": velocity.double()}
+    expected = TorchBackend(parameters).control_step(state, couple, **given)
+    assert largest_change(expected, TorchBackend(parameters).control_step(state, couple, cylinders=cylinders)) > 1e-3
+    assert_close(CudaBackend(parameters).control_step(state, couple, **given), expected)
+
+
+def test_a_post_that_comes_from_afar_is_not_missed():
+    """It comes over twice its reach within the step; the rod is at rest until then."""
+    parameters = arm(n_elements=3, base_length=0.05, substeps=60)
+    state, couple = straight_rods(parameters, 1), torch.zeros(1, 3, 3, dtype=torch.float64)
+    cylinders = cylinders_at([[0.1, -0.2, 0.05]], [[0.0, 1.0, 0.0]], [0.4], [0.01])
+    given = {"cylinders": cylinders, "cylinder_velocity": torch.tensor([[[-4.0, 0.0, 0.0]]], dtype=torch.float64)}
+    assert_identical(TorchBackend(parameters).control_step(state, couple, **given, substeps=40), state)
+    expected = TorchBackend(parameters).control_step(state, couple, **given)
+    assert largest_change(expected, state) > 1e-3
+    assert_close(CudaBackend(parameters).control_step(state, couple, **given), expected, 1e-9)
+
+
 def test_a_post_far_away_is_not_forgotten_until_the_rod_arrives():
     """The rod flies 20 radii; nothing is near when the step begins."""
     parameters = arm(n_elements=3, base_length=0.05, substeps=60, youngs_modulus=1e2, shear_modulus=4e1)

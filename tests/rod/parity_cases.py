@@ -23,6 +23,10 @@ class Case:
     ``torque`` is ``none``, ``constant`` (``push`` alone), ``smooth`` (random sines of time and arc length up to
     ``peak``, plus ``push``) or ``bang-bang`` (``peak`` with a random sign that is drawn anew every 0.12 s). With
     ``n_agents`` the last two give the amplitudes of that many control points instead of a field along the arm.
+
+    Posts stand still or move, with a velocity that is constant in a control step: ``sway`` along y (a sine), ``drift``
+    along y at a constant speed, there and back, ``press`` towards -x, or ``jerk`` (each post another velocity in
+    another direction every third step).
     """
 
     seconds: float = 0.52
@@ -33,6 +37,7 @@ class Case:
     n_agents: int | None = None
     seed: int = 0
     posts: tuple[Post, ...] = ()
+    post_motion: str | None = None
     tip_force: tuple[float, float, float] | None = None
     moves: bool = True
 
@@ -49,6 +54,20 @@ class Case:
         force = np.zeros((3, self.parameters.n_nodes))
         force[:, -1] = self.tip_force
         return force
+
+    def velocity(self) -> Callable[[int], Array] | None:
+        """Velocity of the posts in m/s, ``(posts, 3)``, as a function of the control step; None: they stand still."""
+        if self.post_motion is None:
+            return None
+        count, time = len(self.posts), self.parameters.control_dt
+        drawn = np.random.default_rng(self.seed).uniform(-0.6, 0.6, (100, count, 3))
+        along: dict[str, Callable[[int], Array]] = {
+            "sway": lambda step: 0.5 * np.cos(8.0 * time * step) * np.array([0.0, 1.0, 0.0]),
+            "drift": lambda step: np.array([0.0, 0.2 if step // 8 % 2 == 0 else -0.2, 0.0]),
+            "press": lambda step: np.array([-0.3, 0.0, 0.0]),
+            "jerk": lambda step: drawn[step // 3],
+        }
+        return lambda step: np.broadcast_to(along[self.post_motion](step), (count, 3)).copy()
 
     def couple(self) -> Callable[[int], Array]:
         """External couple on the elements, N m, ``(3, n_elements)``, as a function of the control step."""
@@ -146,20 +165,28 @@ CASES = {
     "20 elements, one post": Case(
         parameters=RodParameters(n_elements=20), seed=3, peak=5.0, push=(20.0, 2.0), posts=ONE_POST
     ),
+    "post that sways": Case(1.0, seed=3, peak=5.0, push=(20.0, 2.0), posts=ONE_POST, post_motion="sway"),
+    "post that presses": Case(seed=3, peak=5.0, push=(12.0, 2.0), posts=ONE_POST, post_motion="press"),
+    "wall that drifts, friction": Case(
+        1.0, FRICTION, seed=2, peak=10.0, push=(16.0, 2.0), posts=WALL, post_motion="drift"
+    ),
+    "bars that jerk, friction": Case(
+        0.8, FRICTION, seed=12, peak=5.0, push=(20.0, 0.0), posts=OBLIQUE_BAR + SLANTED_POST, post_motion="jerk"
+    ),
 }
 
 
 def pyelastica_trajectory(case: Case, pruning: bool = False) -> History:
     """What PyElastica computes; ``pruning`` as shipped, or every pair of element and cylinder."""
     force = None if case.force is None else lambda step: case.force
-    return simulate(case.parameters, case.couple(), case.steps, case.posts, force, pruning)
+    return simulate(case.parameters, case.couple(), case.steps, case.posts, force, pruning, case.velocity())
 
 
 def together(cases: dict[str, Case]) -> Iterable[dict[str, Case]]:
-    """Cases that fit into one batch: the same arm, and all with cylinders or all without."""
-    groups: dict[tuple[RodParameters, bool], dict[str, Case]] = {}
+    """Cases that fit into one batch: the same arm; all with cylinders or all without; all of these still or moving."""
+    groups: dict[tuple[RodParameters, bool, bool], dict[str, Case]] = {}
     for name, case in cases.items():
-        groups.setdefault((case.parameters, bool(case.posts)), {})[name] = case
+        groups.setdefault((case.parameters, bool(case.posts), bool(case.post_motion)), {})[name] = case
     return groups.values()
 
 
@@ -175,8 +202,11 @@ def our_trajectories(backend: str, cases: dict[str, Case]) -> dict[str, dict[str
     states = []
     for step in range(max(case.steps for case in cases.values())):
         couple = torch.as_tensor(np.stack([couple(step) for couple in couples]))
-        state = rod.control_step(state, couple, force=force, cylinders=cylinders)
+        velocity = _velocities(cases, step)
+        state = rod.control_step(state, couple, force=force, cylinders=cylinders, cylinder_velocity=velocity)
         states.append(state)
+        if cylinders is not None and velocity is not None:
+            cylinders.start += parameters.control_dt * velocity
     return {
         name: {
             quantity: np.stack([getattr(state, quantity)[i].numpy() for state in states[: case.steps]])
@@ -184,6 +214,17 @@ def our_trajectories(backend: str, cases: dict[str, Case]) -> dict[str, dict[str
         }
         for i, (name, case) in enumerate(cases.items())
     }
+
+
+def _velocities(cases: dict[str, Case], step: int) -> torch.Tensor | None:
+    """Velocities of all cases' posts, padded as ``as_cylinders`` does; None where none moves."""
+    if not any(case.post_motion for case in cases.values()):
+        return None
+    velocity = torch.zeros((len(cases), max(len(case.posts) for case in cases.values()), 3), dtype=torch.float64)
+    for row, case in enumerate(cases.values()):
+        if (given := case.velocity()) is not None:
+            velocity[row, : len(case.posts)] = torch.as_tensor(given(step))
+    return velocity
 
 
 def largest_difference(ours: dict[str, Array], theirs: History, quantity: str = "position") -> float:

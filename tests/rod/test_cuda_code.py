@@ -19,7 +19,7 @@ DTYPES = {np.float64: torch.float64, np.float32: torch.float32}
 PRECISIONS = list(DTYPES)
 
 
-def launch(n_elements: int, real: type, contact: str | None) -> tuple[Any, tuple]:
+def launch(n_elements: int, real: type, contact: str | None, moving: bool) -> tuple[Any, tuple]:
     """The kernel that a control step launches, and its arguments."""
     parameters = RodParameters(n_elements=n_elements, contact_model=contact or "pyelastica")
     state = straight_rods(parameters, 2, DTYPES[real])
@@ -35,13 +35,14 @@ def launch(n_elements: int, real: type, contact: str | None) -> tuple[Any, tuple
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(cuda_backend, "_check_device", lambda *arguments, **named: None)
         couple = torch.zeros(2, 3, n_elements)
-        obstacles = cylinders if contact else None
-        return cuda_code.launched(cuda_backend, lambda: backend.control_step(state, couple, cylinders=obstacles))
+        given = {"cylinders": cylinders if contact else None}
+        given |= {"cylinder_velocity": torch.ones(2, 3, 3)} if moving else {}
+        return cuda_code.launched(cuda_backend, lambda: backend.control_step(state, couple, **given))
 
 
 @cache
-def ptx(n_elements: int, real: type, contact: str | None) -> str:
-    return cuda_code.ptx(*launch(n_elements, real, contact))
+def ptx(n_elements: int, real: type, contact: str | None, moving: bool = False) -> str:
+    return cuda_code.ptx(*launch(n_elements, real, contact, moving))
 
 
 @pytest.fixture(autouse=True)
@@ -50,13 +51,29 @@ def _compiler() -> None:
         pytest.skip(cuda_code.why_not())
 
 
-def assembled(n_elements: int, real: type, contact: str | None, folder: Path) -> dict[str, int]:
-    return cuda_code.assembled(ptx(n_elements, real, contact), folder, most_registers(n_elements, real))
+def assembled(
+    n_elements: int, real: type, contact: str | None, folder: Path, moving: bool = False
+) -> dict[str, int]:
+    return cuda_code.assembled(ptx(n_elements, real, contact, moving), folder, most_registers(n_elements, real))
 
 
 @pytest.mark.parametrize("contact", [None, "pyelastica", "exact"])
 def test_float32_code_holds_no_float64_instruction(contact: str | None):
     assert ".f64" not in ptx(60, np.float32, contact)
+
+
+@pytest.mark.parametrize("contact", ["pyelastica", "exact"])
+def test_float32_code_with_cylinders_that_move_holds_no_float64_instruction(contact: str):
+    assert ".f64" not in ptx(60, np.float32, contact, moving=True)
+
+
+@pytest.mark.parametrize("contact", ["pyelastica", "exact"])
+@pytest.mark.parametrize("real", PRECISIONS)
+def test_the_arm_stays_in_registers_among_cylinders_that_move(real: type, contact: str, tmp_path: Path):
+    used = assembled(60, real, contact, tmp_path, moving=True)
+    print(used)
+    assert used["registers"] <= {np.float32: 96, np.float64: 168}[real]
+    assert used["spills"] <= {np.float32: 0, np.float64: 120}[real]
 
 
 def test_float64_code_holds_float64_instructions():

@@ -29,6 +29,7 @@ class Backend(Protocol):
         cylinders: Cylinders | None = None,
         active: Tensor | None = None,
         substeps: int | None = None,
+        cylinder_velocity: Tensor | None = None,
     ) -> RodState:
         """Advance every active rod by one control step and return a new state."""
         ...

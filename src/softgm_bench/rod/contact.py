@@ -1,4 +1,4 @@
-"""This module computes PyElastica's penalty forces between rods and fixed cylinders.
+"""This module computes PyElastica's penalty forces between rods and cylinders.
 
 Vectors over elements keep PyElastica's layout, components before elements. A pair (cylinder, element) adds one
 dimension in front: ``(num_envs, n_cylinders, 3, n_elements)``. There are no matrix products, whose rounding depends on
@@ -46,9 +46,14 @@ def safe_norm(vector: Tensor, dim: int = -2) -> Tensor:
 
 
 def contact_forces(
-    position: Tensor, velocity: Tensor, radius: Tensor, cylinders: Cylinders, parameters: RodParameters
+    position: Tensor,
+    velocity: Tensor,
+    radius: Tensor,
+    cylinders: Cylinders,
+    parameters: RodParameters,
+    cylinder_velocity: Tensor | None = None,
 ) -> Tensor:
-    """Return the forces of fixed cylinders on nodes, N (PyElastica's ``_calculate_contact_forces_rod_cylinder``).
+    """Return the forces of cylinders on nodes, N (PyElastica's ``_calculate_contact_forces_rod_cylinder``).
 
     Its quirks are kept: an element's segment starts at the element's midpoint and has its full edge, and the first and
     last elements split their force 2/3 : 4/3 between end and inner node. Its bounding-box pruning, which misses
@@ -60,6 +65,7 @@ def contact_forces(
         radius: current radii, ``(num_envs, n_elements)``.
         cylinders: of the same ``num_envs``; values of masked ones are never read.
         parameters: stiffness, damping and friction.
+        cylinder_velocity: m/s, ``(num_envs, n_cylinders, 3)``, PyElastica's ``velocity_cylinder``; None: they rest.
 
     Returns:
         ``(num_envs, 3, n_nodes)`` in the world frame.
@@ -69,8 +75,10 @@ def contact_forces(
     cylinder_start, cylinder_edge, cylinder_radius = _existing(cylinders)
     centre = 0.5 * (position[:, None, :, 1:] + position[:, None, :, :-1])
     edge = position[:, None, :, 1:] - position[:, None, :, :-1]
-    # Relative velocity of the cylinder, which is at rest, seen from the element.
+    # Relative velocity of the cylinder, seen from the element.
     approach = -0.5 * (velocity[:, None, :, 1:] + velocity[:, None, :, :-1])
+    if cylinder_velocity is not None:
+        approach = approach + cylinder_velocity[..., None]
 
     gap = shortest_connection(centre, edge, cylinder_start, cylinder_edge)
     distance = safe_norm(gap)

@@ -37,6 +37,7 @@ class CudaBackend:
         cylinders: Cylinders | None = None,
         active: Tensor | None = None,
         substeps: int | None = None,
+        cylinder_velocity: Tensor | None = None,
     ) -> RodState:
         """Advance every rod by one control step.
 
@@ -47,6 +48,8 @@ class CudaBackend:
             cylinders: what the rods may touch.
             active: ``(num_envs,)`` bool; rods that are not come back as they were.
             substeps: of this step, the parameters' number by default.
+            cylinder_velocity: with which the cylinders move on from where they are now, m/s, without turning,
+                ``(num_envs, n_cylinders, 3)``; constant in the step. By default they stand still.
 
         Returns:
             A new state.
@@ -55,10 +58,17 @@ class CudaBackend:
             ValueError: if the arguments' shapes do not fit together, a tensor is not where the state is, or a gradient
                 is asked for.
         """
-        check_inputs(self.parameters, state, couple, force, cylinders, active)
+        check_inputs(self.parameters, state, couple, force, cylinders, active, cylinder_velocity)
         refuse_gradients("cuda", state, couple, force)
         device, dtype = state.position.device, state.position.dtype
-        _check_device(device, couple=couple, force=force, active=active, cylinders=cylinders)
+        _check_device(
+            device,
+            couple=couple,
+            force=force,
+            active=active,
+            cylinders=cylinders,
+            cylinder_velocity=cylinder_velocity,
+        )
         if dtype not in REAL:
             raise ValueError(f"the state is {dtype}: the cuda backend computes in float64 or float32")
         old = _inputs(dtype, state.position, state.director, state.velocity, state.omega)
@@ -67,18 +77,21 @@ class CudaBackend:
             # what is absent is never read; something of its type stands for it
             none = cylinders is None or cylinders.mask.shape[1] == 0
             contact = None if none else self.parameters.contact_model
+            moving = contact is not None and cylinder_velocity is not None
             nothing = torch.empty((1, 1, 1), dtype=dtype, device=device)
             never = torch.empty((1, 1), dtype=torch.bool, device=device)
             couple, force_or_nothing = _inputs(dtype, couple, nothing if force is None else force)
-            obstacles = [nothing, nothing, nothing[0], nothing[0], never]
+            obstacles = [nothing, nothing, nothing[0], nothing[0], never, nothing]
             if cylinders is not None and contact is not None:
                 geometry = (cylinders.start, cylinders.axis, cylinders.length, cylinders.radius)
-                obstacles = [*_inputs(dtype, *geometry), cylinders.mask.contiguous()]
+                velocity = nothing if cylinder_velocity is None else cylinder_velocity
+                *geometry, velocity = _inputs(dtype, *geometry, velocity)
+                obstacles = [*geometry, cylinders.mask.contiguous(), velocity]
             columns = scratch_columns(self.parameters.n_elements, REAL[dtype])
             scratch = torch.empty((len(couple), ROWS, columns), dtype=dtype, device=device) if columns else nothing
             flags = never[0] if active is None else active.bool().contiguous()
             launch(
-                make_step(self.parameters.n_elements, REAL[dtype], contact),
+                make_step(self.parameters.n_elements, REAL[dtype], contact, moving),
                 len(couple),
                 self.parameters.n_nodes,
                 [*old, *new, couple, force_or_nothing, flags, *obstacles, scratch],

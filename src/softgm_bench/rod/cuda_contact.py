@@ -8,7 +8,7 @@ space contact costs a comparison a substep. Near ones are computed in full. The 
 from collections.abc import Callable
 from functools import lru_cache
 from math import sqrt
-from typing import Any
+from typing import Any, NamedTuple
 
 from numba import cuda
 
@@ -34,15 +34,15 @@ else:
 
 
 @lru_cache
-def make_press(n_elements: int, real: type, contact_model: str) -> Callable[..., Any]:
-    """Make the device function for an element's contact with all cylinders of its rod."""
+def make_press(n_elements: int, real: type, contact_model: str, moving: bool) -> Callable[..., Any]:
+    """Make the device function for an element's contact with all cylinders of its rod, which may be ``moving``."""
     zero, safety, half = real(0.0), real(SAFETY), real(0.5)
-    screen = _make_screen(real)
-    touch = _make_touch(n_elements, real, contact_model)
+    screen = _make_screen(real, moving)
+    touch = _make_touch(n_elements, real, contact_model, moving)
 
     def press(
         c, k, x, y, z, nx, ny, nz, vx, vy, vz, wx, wy, wz, current, duration, travelled, next_check, candidates,
-        b, start, axis, length, radius, mask,
+        b, start, axis, length, radius, mask, velocities, substep, substeps,
     ):  # fmt: skip
         """Force of the cylinders on the two nodes of an element, and what is kept between substeps.
 
@@ -59,7 +59,9 @@ def make_press(n_elements: int, real: type, contact_model: str) -> Callable[...,
             next_check: ``travelled`` plus reach at which a cylinder that is no candidate may touch.
             candidates: bit set.
             b: environment.
-            start, axis, length, radius, mask: of all environments' cylinders.
+            start, axis, length, radius, mask: of all environments' cylinders as the control step begins.
+            velocities: their velocities, ``(num_envs, n_cylinders, 3)``; never read where cylinders stand still.
+            substep, substeps: which one of the control step this is, from 0, and of how many.
         """
         ux, uy, uz = vx + wx, vy + wy, vz + wz
         travelled += half * safety * duration * real(sqrt(ux * ux + uy * uy + uz * uz))
@@ -68,8 +70,9 @@ def make_press(n_elements: int, real: type, contact_model: str) -> Callable[...,
         px, py, pz, qx, qy, qz, behind = zero, zero, zero, zero, zero, zero, mask.shape[1]
         if travelled + reach >= next_check:
             candidates, clear = screen(
-                half * (x + nx), half * (y + ny), half * (z + nz), reach, b, start, axis, length, radius, mask
-            )
+                c, half * (x + nx), half * (y + ny), half * (z + nz), reach, b, start, axis, length, radius, mask,
+                velocities, substep, substeps,
+            )  # fmt: skip
             next_check = travelled + clear
             behind = CANDIDATES
         bits = candidates
@@ -82,8 +85,9 @@ def make_press(n_elements: int, real: type, contact_model: str) -> Callable[...,
                 behind += 1
             if mask[b, i]:
                 fx, fy, fz, gx, gy, gz = touch(
-                    c, k, x, y, z, nx, ny, nz, vx, vy, vz, wx, wy, wz, own_radius, b, i, start, axis, length, radius
-                )
+                    c, k, x, y, z, nx, ny, nz, vx, vy, vz, wx, wy, wz, own_radius, b, i, start, axis, length, radius,
+                    velocities, substep,
+                )  # fmt: skip
                 px, py, pz, qx, qy, qz = px - fx, py - fy, pz - fz, qx - gx, qy - gy, qz - gz
         return px, py, pz, qx, qy, qz, travelled, next_check, candidates
 
@@ -97,27 +101,72 @@ def make_no_press(real: type) -> Callable[..., Any]:
 
     def press(
         c, k, x, y, z, nx, ny, nz, vx, vy, vz, wx, wy, wz, current, duration, travelled, next_check, candidates,
-        b, start, axis, length, radius, mask,
+        b, start, axis, length, radius, mask, velocities, substep, substeps,
     ):  # fmt: skip
         return zero, zero, zero, zero, zero, zero, travelled, next_check, candidates
 
     return device(press)
 
 
-def _make_screen(real: type) -> Callable[..., Any]:
+class _Motion(NamedTuple):
+    """These are device functions on one cylinder, which do nothing where cylinders stand still.
+
+    ``place`` gives a coordinate of its start in the middle of a substep, ``relative`` a component of a velocity as seen
+    from it, ``gain`` the most that it can yet come nearer in this control step.
+    """
+
+    place: Callable[..., Any]
+    relative: Callable[..., Any]
+    gain: Callable[..., Any]
+
+
+@lru_cache
+def _make_motion(real: type, moving: bool) -> _Motion:
+    zero, safety = real(0.0), real(SAFETY)
+
+    def fixed(c, start, velocities, b, i, axis, substep):
+        return start[b, i, axis]
+
+    def own(velocity, velocities, b, i, axis):
+        return velocity
+
+    def nothing(c, velocities, b, i, substep, substeps):
+        return zero
+
+    def place(c, start, velocities, b, i, axis, substep):
+        return start[b, i, axis] + (c.half_dt + real(substep) * c.dt) * velocities[b, i, axis]
+
+    def relative(velocity, velocities, b, i, axis):
+        return velocity - velocities[b, i, axis]
+
+    def gain(c, velocities, b, i, substep, substeps):
+        ux, uy, uz = velocities[b, i, 0], velocities[b, i, 1], velocities[b, i, 2]
+        return safety * real(substeps - substep) * c.dt * real(sqrt(ux * ux + uy * uy + uz * uz))
+
+    return _Motion(*(device(f) for f in ((place, relative, gain) if moving else (fixed, own, nothing))))
+
+
+def _make_screen(real: type, moving: bool) -> Callable[..., Any]:
     zero, one, far, skin = real(0.0), real(1.0), real(1e30), real(SKIN)
     offset = make_offset(device)
+    place, _, gain = _make_motion(real, moving)
 
-    def screen(x, y, z, reach, b, start, axis, length, radius, mask):
-        """Bit set of near cylinders, and the smallest gap between a midpoint and the surface of any other."""
+    def screen(c, x, y, z, reach, b, start, axis, length, radius, mask, velocities, substep, substeps):
+        """Bit set of near cylinders, and the smallest gap between a midpoint and the surface of any other.
+
+        Of a gap counts what no motion of the cylinder can close before the control step ends.
+        """
         candidates, clear, near = 0, far, skin * reach
         for i in range(mask.shape[1]):
             if mask[b, i]:
-                dx, dy, dz = x - start[b, i, 0], y - start[b, i, 1], z - start[b, i, 2]
+                dx = x - place(c, start, velocities, b, i, 0, substep)
+                dy = y - place(c, start, velocities, b, i, 1, substep)
+                dz = z - place(c, start, velocities, b, i, 2, substep)
                 ax, ay, az = axis[b, i, 0], axis[b, i, 1], axis[b, i, 2]
                 square = ax * ax + ay * ay + az * az
                 dx, dy, dz = offset(dx, dy, dz, ax, ay, az, one / square, zero, length[b, i])
                 gap = real(sqrt(dx * dx + dy * dy + dz * dz)) - radius[b, i]
+                gap -= gain(c, velocities, b, i, substep, substeps)
                 if i < CANDIDATES and gap <= near:
                     candidates |= 1 << i
                 else:
@@ -127,22 +176,29 @@ def _make_screen(real: type) -> Callable[..., Any]:
     return device(screen)
 
 
-def _make_touch(n_elements: int, real: type, contact_model: str) -> Callable[..., Any]:
+def _make_touch(n_elements: int, real: type, contact_model: str, moving: bool) -> Callable[..., Any]:
     zero = real(0.0)
     meet, forces = make_pair(contact_model, n_elements, real, device)
+    place, relative, _ = _make_motion(real, moving)
 
     def touch(
-        c, k, x, y, z, nx, ny, nz, vx, vy, vz, wx, wy, wz, own_radius, b, i, start, axis, length, radius
+        c, k, x, y, z, nx, ny, nz, vx, vy, vz, wx, wy, wz, own_radius, b, i, start, axis, length, radius,
+        velocities, substep,
     ):  # fmt: skip
         """Forces with which the two nodes of an element push cylinder ``i``."""
         extent = length[b, i]
         cylinder = (
-            start[b, i, 0], start[b, i, 1], start[b, i, 2],
+            place(c, start, velocities, b, i, 0, substep),
+            place(c, start, velocities, b, i, 1, substep),
+            place(c, start, velocities, b, i, 2, substep),
             axis[b, i, 0] * extent, axis[b, i, 1] * extent, axis[b, i, 2] * extent, radius[b, i],
         )  # fmt: skip
         touching, found = meet(x, y, z, nx, ny, nz, own_radius, cylinder)
         if not touching:
             return zero, zero, zero, zero, zero, zero
+        vx, wx = relative(vx, velocities, b, i, 0), relative(wx, velocities, b, i, 0)
+        vy, wy = relative(vy, velocities, b, i, 1), relative(wy, velocities, b, i, 1)
+        vz, wz = relative(vz, velocities, b, i, 2), relative(wz, velocities, b, i, 2)
         contact = c.contact_stiffness, c.contact_damping, c.friction, c.slip_damping
         return forces(found, k, vx, vy, vz, wx, wy, wz, c.rest_length, contact)
 

@@ -27,24 +27,28 @@ _SHARED_BYTES = 49152  # that a block can have without asking
 
 
 @lru_cache
-def make_step(n_elements: int, real: type, contact: str | None) -> Callable[..., Any]:
+def make_step(n_elements: int, real: type, contact: str | None, moving: bool = False) -> Callable[..., Any]:
     """Build the kernel for one element count, precision and contact model; Numba compiles it at its first launch.
 
+    Cylinders that stand still have a kernel without a trace of motion, ``moving`` ones have one of their own.
+
     Launch with a block for each rod and ``n_elements + 1`` threads. Arguments: the state's four arrays, the four that
-    receive the new state, couple, force, active, the cylinders' five arrays (never read without a contact model),
-    scratch (see ``scratch_columns``), whether (1 or 0) force and active are given, ``Coefficients``, the substeps.
+    receive the new state, couple, force, active, the cylinders' five arrays (never read without a contact model) and
+    their velocities (never read unless they are moving), scratch (see ``scratch_columns``), whether (1 or 0) force and
+    active are given, ``Coefficients``, the substeps.
     """
     n, n_columns, zero = n_elements, n_elements + 2, real(0.0)
     on_chip = scratch_columns(n, real) == 0
     far = real(1e30)
     load, loads, store = _make_load(n, real), _make_loads(n, real), _make_store(n)
     drift, show = _make_drift(real), device(_show)
-    act, accelerate = _make_act(n, real, contact), _make_accelerate(n, real)
+    act, accelerate = _make_act(n, real, contact, moving), _make_accelerate(n, real)
     single, straighten = real is np.float32, make_physics(real).straighten
 
     def step(
         position, director, velocity, omega, new_position, new_director, new_velocity, new_omega,
-        couple, force, active, start, axis, length, radius, mask, scratch, with_force, with_active, c, substeps,
+        couple, force, active, start, axis, length, radius, mask, velocities, scratch, with_force, with_active, c,
+        substeps,
     ):  # fmt: skip
         b, k = cuda.blockIdx.x, cuda.threadIdx.x
         if on_chip:
@@ -60,7 +64,7 @@ def make_step(n_elements: int, real: type, contact: str | None) -> Callable[...,
             t0, t1, t2, gx, gy, gz = loads(c, couple, force, with_force, b, k)
             travelled, next_check, candidates = zero, -far, 0
             duration = c.half_dt
-            for _ in range(substeps):
+            for substep in range(substeps):
                 x, y, z, q00, q01, q02, q10, q11, q12, q20, q21, q22 = drift(
                     duration, k, x, y, z, vx, vy, vz, q00, q01, q02, q10, q11, q12, q20, q21, q22, w0, w1, w2
                 )
@@ -68,7 +72,8 @@ def make_step(n_elements: int, real: type, contact: str | None) -> Callable[...,
                 cuda.syncthreads()
                 fx, fy, fz, m0, m1, m2, k0, k1, k2, current, travelled, next_check, candidates = act(
                     c, node, joint, k, x, y, z, vx, vy, vz, q00, q01, q02, q10, q11, q12, q20, q21, q22, w0, w1, w2,
-                    duration, travelled, next_check, candidates, b, start, axis, length, radius, mask,
+                    duration, travelled, next_check, candidates, b, start, axis, length, radius, mask, velocities,
+                    substep, substeps,
                 )  # fmt: skip
                 cuda.syncthreads()
                 vx, vy, vz, w0, w1, w2 = accelerate(
@@ -190,15 +195,16 @@ def _show(node, k, x, y, z, vx, vy, vz, q00, q01, q02, q10, q11, q12, q20, q21, 
     node[12, k], node[13, k], node[14, k] = q20, q21, q22
 
 
-def _make_act(n: int, real: type, contact: str | None) -> Callable[..., Any]:
+def _make_act(n: int, real: type, contact: str | None, moving: bool) -> Callable[..., Any]:
     zero = real(0.0)
     physics = make_physics(real)
     strain, curvature = physics.strain, physics.curvature
-    press = make_press(n, real, contact) if contact else make_no_press(real)
+    press = make_press(n, real, contact, moving) if contact else make_no_press(real)
 
     def act(
         c, node, joint, k, x, y, z, vx, vy, vz, q00, q01, q02, q10, q11, q12, q20, q21, q22, w0, w1, w2,
-        duration, travelled, next_check, candidates, b, start, axis, length, radius, mask,
+        duration, travelled, next_check, candidates, b, start, axis, length, radius, mask, velocities,
+        substep, substeps,
     ):  # fmt: skip
         """Forces, torques and curvature of element k; ``joint`` receives what its neighbours need.
 
@@ -222,7 +228,7 @@ def _make_act(n: int, real: type, contact: str | None) -> Callable[..., Any]:
                 )  # fmt: skip
             px, py, pz, qx, qy, qz, travelled, next_check, candidates = press(
                 c, k, x, y, z, nx, ny, nz, vx, vy, vz, wx, wy, wz, current, duration, travelled, next_check, candidates,
-                b, start, axis, length, radius, mask,
+                b, start, axis, length, radius, mask, velocities, substep, substeps,
             )  # fmt: skip
             outer_x, outer_y, outer_z = qx - fx, qy - fy, qz - fz
             fx, fy, fz = fx + px, fy + py, fz + pz

@@ -30,9 +30,14 @@ GAUSS_NODES = GAUSS_NODES + 0.5
 
 
 def exact_contact_forces(
-    position: Tensor, velocity: Tensor, radius: Tensor, cylinders: Cylinders, parameters: RodParameters
+    position: Tensor,
+    velocity: Tensor,
+    radius: Tensor,
+    cylinders: Cylinders,
+    parameters: RodParameters,
+    cylinder_velocity: Tensor | None = None,
 ) -> Tensor:
-    """Return the forces of fixed cylinders on the rods' nodes in N, integrals of the density above over the contact.
+    """Return the forces of cylinders on the rods' nodes in N, integrals of the density above over the contact.
 
     The interval of contact is found in closed form, so the quadrature sees a smooth function except where the element
     passes from the side of a cylinder to its round end. Each point's force goes to the element's two nodes by the lever
@@ -44,6 +49,7 @@ def exact_contact_forces(
         radius: current radii, ``(num_envs, n_elements)``.
         cylinders: of the same ``num_envs``; values of masked ones are never read.
         parameters: stiffness, damping, friction and the length that they refer to.
+        cylinder_velocity: m/s, ``(num_envs, n_cylinders, 3)``; None: they rest.
 
     Returns:
         ``(num_envs, 3, n_nodes)`` in the world frame.
@@ -65,6 +71,8 @@ def exact_contact_forces(
     nodes, weights = (position.new_tensor(x)[:, None, None, None] for x in (GAUSS_NODES, GAUSS_WEIGHTS))
     xi = (enter + nodes * (leave - enter)).unsqueeze(-2)  # (points, num_envs, n_cylinders, 1, n_elements)
     approach = -(velocity[:, None, :, :-1] + xi * (velocity[..., 1:] - velocity[..., :-1])[:, None])
+    if cylinder_velocity is not None:
+        approach = approach + cylinder_velocity[..., None]
     density = _force_density(start + xi * edge, approach, axis, length, reach, parameters)
     rest_length = parameters.base_length / parameters.n_elements
     force = (weights * (rest_length * (leave - enter))).unsqueeze(-2) * density

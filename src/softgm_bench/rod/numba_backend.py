@@ -14,10 +14,20 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from softgm_bench.rod import forks
-from softgm_bench.rod.numba_contact import COLUMNS, NEXT_CHECK, make_contact, make_touch
+from softgm_bench.rod.numba_contact import (
+    COLUMNS,
+    MOVING_COLUMNS,
+    NEXT_CHECK,
+    ORIGIN,
+    VELOCITY,
+    make_contact,
+    make_motion,
+    make_touch,
+    told_apart,
+)
 from softgm_bench.rod.numba_kernel import jit, larger, make_kernel, make_straighten
 from softgm_bench.rod.numba_layout import CACHE_LINE, Layout, constant_rows, make_layout
-from softgm_bench.rod.parameters import CONTACT_MODELS, RodParameters, rod_constants
+from softgm_bench.rod.parameters import RodParameters, rod_constants
 from softgm_bench.rod.scalar_contact import EDGE, RADIUS, START
 from softgm_bench.rod.state import Cylinders, RodState, check_inputs, refuse_gradients
 
@@ -42,6 +52,7 @@ class NumbaBackend:
         cylinders: Cylinders | None = None,
         active: Tensor | None = None,
         substeps: int | None = None,
+        cylinder_velocity: Tensor | None = None,
     ) -> RodState:
         """Advance every rod by one control step.
 
@@ -52,6 +63,8 @@ class NumbaBackend:
             cylinders: what the rods may touch.
             active: ``(num_envs,)`` bool; rods that are not come back as they were.
             substeps: of this step, the parameters' number by default.
+            cylinder_velocity: with which the cylinders move on from where they are now, m/s, without turning,
+                ``(num_envs, n_cylinders, 3)``; constant in the step. By default they stand still.
 
         Returns:
             A new state.
@@ -59,7 +72,7 @@ class NumbaBackend:
         Raises:
             ValueError: if the arguments' shapes do not fit together, or a gradient is asked for.
         """
-        check_inputs(self.parameters, state, couple, force, cylinders, active)
+        check_inputs(self.parameters, state, couple, force, cylinders, active, cylinder_velocity)
         forks.check()
         refuse_gradients("numba", state, couple, force)
         dtype = state.position.dtype
@@ -69,10 +82,11 @@ class NumbaBackend:
         arrays = [field.numpy() for field in (new.position, new.director, new.velocity, new.omega)]
         weight = self._weight.to(dtype).expand(num_envs, 3, n + 1)
         total_force = (weight if force is None else force.to(dtype) + weight).contiguous()
-        table = _cylinder_table(cylinders, num_envs, dtype)
+        table = _cylinder_table(cylinders, cylinder_velocity, num_envs, dtype)
         if active is None:
             active = torch.ones(num_envs, dtype=torch.bool)
-        step = _make_step(n, arrays[0].dtype.type, self.parameters.contact_model)
+        moving = cylinder_velocity is not None
+        step = _make_step(n, arrays[0].dtype.type, self.parameters.contact_model, moving)
         step(
             *arrays,
             couple.detach().to(dtype).contiguous().numpy(),
@@ -98,11 +112,17 @@ class NumbaBackend:
         return self._tables[dtype]
 
 
-def _cylinder_table(cylinders: Cylinders | None, num_envs: int, dtype: torch.dtype) -> Tensor:
-    """Rows of start, edge, radius and next check, ``(num_envs, n_cylinders, 8)``; a masked one is never checked."""
+def _cylinder_table(cylinders: Cylinders | None, velocity: Tensor | None, num_envs: int, dtype: torch.dtype) -> Tensor:
+    """Rows of start, edge, radius and next check, ``(num_envs, n_cylinders, 8)``; a masked one is never checked.
+
+    Where they have a velocity, it and the start at the beginning of the step stand behind, six more columns.
+    """
     if cylinders is None:
         return torch.empty((num_envs, 0, COLUMNS), dtype=dtype)
-    table = torch.empty((*cylinders.mask.shape, COLUMNS), dtype=dtype)
+    table = torch.empty((*cylinders.mask.shape, COLUMNS if velocity is None else MOVING_COLUMNS), dtype=dtype)
+    if velocity is not None:
+        table[..., VELOCITY : VELOCITY + 3] = torch.where(cylinders.mask.unsqueeze(-1), velocity, 0.0)
+        table[..., ORIGIN : ORIGIN + 3] = cylinders.start
     table[..., START : START + 3] = cylinders.start
     table[..., EDGE : EDGE + 3] = cylinders.axis * cylinders.length.unsqueeze(-1)
     table[..., RADIUS] = cylinders.radius
@@ -111,11 +131,12 @@ def _cylinder_table(cylinders: Cylinders | None, num_envs: int, dtype: torch.dty
 
 
 @lru_cache
-def _make_step(n_elements: int, dtype: type, contact_model: str) -> Callable[..., Any]:
-    """Compile the loop over environments and substeps for one element count, precision and contact model."""
-    layout = make_layout(n_elements, dtype)
-    # Code on disk is found by the closure: what differs only in its callees must differ in the layout too.
-    layout = layout._replace(source=layout.source + CONTACT_MODELS.index(contact_model))
+def _make_step(n_elements: int, dtype: type, contact_model: str, moving: bool) -> Callable[..., Any]:
+    """Compile the loop over environments and substeps for one element count, precision and contact model.
+
+    Cylinders that stand still have a loop without a trace of motion.
+    """
+    layout = told_apart(make_layout(n_elements, dtype), contact_model, moving)
     itemsize = np.dtype(dtype).itemsize
     width = CACHE_LINE // itemsize
     single = dtype is np.float32
@@ -140,14 +161,14 @@ def _make_step(n_elements: int, dtype: type, contact_model: str) -> Callable[...
         parallel=True,
         load=_make_load(layout),
         store=_make_store(layout),
-        advance=_make_advance(layout, dtype, contact_model),
+        advance=_make_advance(layout, dtype, contact_model, moving),
         straighten=make_straighten(layout, dtype),
     )
 
 
-def _make_advance(layout: Layout, real: type, contact_model: str) -> Callable[..., Any]:
+def _make_advance(layout: Layout, real: type, contact_model: str, moving: bool) -> Callable[..., Any]:
     p, n = layout, layout.n
-    touch = make_touch(layout, real, contact_model)
+    touch, motion = make_touch(layout, real, contact_model, moving), make_motion(real, moving)
     zero, half, far = real(0.0), real(0.5), real(np.inf)
 
     def advance(s, cylinders, scalars, contact, substeps):
@@ -156,7 +177,8 @@ def _make_advance(layout: Layout, real: type, contact_model: str) -> Callable[..
         fastest = zero
         for k in range(n + 1):
             fastest = larger(fastest, s[p.vx + k] ** 2 + s[p.vy + k] ** 2 + s[p.vz + k] ** 2)
-        travelled = half * dt * np.sqrt(fastest)
+        drift = speed(cylinders)
+        travelled = half * dt * (np.sqrt(fastest) + drift)
         rotate(s, half * dt)
         move(s, half * dt)
         for substep in range(substeps):
@@ -166,6 +188,7 @@ def _make_advance(layout: Layout, real: type, contact_model: str) -> Callable[..
                 touching = False
                 extent = reach(s, volume)
                 if travelled + extent > soonest:
+                    carry(cylinders, substep, dt)
                     touching, soonest = add_contact(s, cylinders, travelled, extent, contact, volume)
                 if touched and not touching:
                     for k in range(n + 1):
@@ -177,11 +200,12 @@ def _make_advance(layout: Layout, real: type, contact_model: str) -> Callable[..
             fastest = push(s, decay)
             # the half steps that end this substep and begin the next one are one
             step = half * dt if substep == substeps - 1 else dt
-            travelled += step * np.sqrt(fastest)
+            travelled += step * (np.sqrt(fastest) + drift)
             rotate(s, step)
             move(s, step)
 
-    return jit(advance, **make_contact(layout, real, touch)._asdict(), **make_kernel(n, real)._asdict())
+    callees = make_contact(layout, real, touch)._asdict() | make_kernel(n, real)._asdict()
+    return jit(advance, **callees, speed=motion.speed, carry=motion.carry)
 
 
 def _make_load(layout: Layout) -> Callable[..., Any]:

@@ -21,8 +21,9 @@ from softgm_bench.rod.numba_layout import Layout
 from softgm_bench.rod.parameters import CONTACT_MODELS
 from softgm_bench.rod.scalar_contact import EDGE, RADIUS, START, make_offset, make_pair
 
-# columns of a cylinder's row behind those of ``scalar_contact``
+# columns of a cylinder's row behind those of ``scalar_contact``; only one that moves has the last two
 NEXT_CHECK, COLUMNS = 7, 8
+VELOCITY, ORIGIN, MOVING_COLUMNS = 8, 11, 14
 
 
 class Contact(NamedTuple):
@@ -43,7 +44,7 @@ def make_contact(layout: Layout, real: type, touch: Callable[..., Any]) -> Conta
         Args:
             s: the rod's buffer, with lengths of this substep.
             cylinders: ``(n_cylinders, 8)``; the last column, the travel at which the cylinder may touch, is updated.
-            travelled: bound on how far any node has moved since the step began, m.
+            travelled: bound on how far any node has moved since the step began, as a cylinder sees it, m.
             extent: of the elements at this substep, m, see ``reach``.
             contact: stiffness, damping, friction and slip damping coefficients.
             volume: largest element volume, m^3.
@@ -115,11 +116,57 @@ def _make_nearest(layout: Layout, real: type) -> Callable[..., Any]:
     return jit(nearest, offset=make_offset(jit))
 
 
+class Motion(NamedTuple):
+    """These are compiled functions on one rod's cylinders, which do nothing where cylinders stand still.
+
+    ``speed`` gives the fastest cylinder's speed, ``carry`` brings the cylinders to where they are in the middle of a
+    substep, ``relative`` sees a component of a velocity from a cylinder.
+    """
+
+    speed: Callable[..., Any]
+    carry: Callable[..., Any]
+    relative: Callable[..., Any]
+
+
 @lru_cache
-def make_touch(layout: Layout, real: type, contact_model: str) -> Callable[..., Any]:
+def make_motion(real: type, moving: bool) -> Motion:
+    """Compile the cylinders' motion: along straight lines, at a speed that is constant in a control step."""
+    zero, half = real(0.0), real(0.5)
+
+    def no_speed(cylinders):
+        return zero
+
+    def stay(cylinders, substep, dt):
+        pass
+
+    def own(velocity, cylinder, i):
+        return velocity
+
+    def speed(cylinders):
+        fastest = zero
+        for c in range(cylinders.shape[0]):
+            x, y, z = cylinders[c, VELOCITY], cylinders[c, VELOCITY + 1], cylinders[c, VELOCITY + 2]
+            fastest = larger(fastest, x * x + y * y + z * z)
+        return real(sqrt(fastest))
+
+    def carry(cylinders, substep, dt):
+        time = (real(substep) + half) * dt
+        for c in range(cylinders.shape[0]):
+            for i in range(3):
+                cylinders[c, START + i] = cylinders[c, ORIGIN + i] + time * cylinders[c, VELOCITY + i]
+
+    def relative(velocity, cylinder, i):
+        return velocity - cylinder[VELOCITY + i]
+
+    if moving:
+        return Motion(jit(speed), jit(carry), jit(relative, inline=True))
+    return Motion(jit(no_speed, inline=True), jit(stay, inline=True), jit(own, inline=True))
+
+
+@lru_cache
+def make_touch(layout: Layout, real: type, contact_model: str, moving: bool) -> Callable[..., Any]:
     """Compile the force of one cylinder on one element for one layout, precision and contact model."""
-    # Code on disk is found by the closure: what differs only in its callees must differ in the layout too.
-    p = layout._replace(source=layout.source + CONTACT_MODELS.index(contact_model))
+    p = told_apart(layout, contact_model, moving)
     inverse_pi = real(1.0 / np.pi)
 
     def touch(s, k, cylinder, contact, volume):
@@ -139,12 +186,12 @@ def make_touch(layout: Layout, real: type, contact_model: str) -> Callable[..., 
         fx, fy, fz, gx, gy, gz = forces(
             found,
             k,
-            s[p.vx + k],
-            s[p.vy + k],
-            s[p.vz + k],
-            s[p.vx + k + 1],
-            s[p.vy + k + 1],
-            s[p.vz + k + 1],
+            relative(s[p.vx + k], cylinder, 0),
+            relative(s[p.vy + k], cylinder, 1),
+            relative(s[p.vz + k], cylinder, 2),
+            relative(s[p.vx + k + 1], cylinder, 0),
+            relative(s[p.vy + k + 1], cylinder, 1),
+            relative(s[p.vz + k + 1], cylinder, 2),
             s[p.rest + k],
             contact,
         )
@@ -155,4 +202,13 @@ def make_touch(layout: Layout, real: type, contact_model: str) -> Callable[..., 
         s[p.fy + k + 1] -= gy
         s[p.fz + k + 1] -= gz
 
-    return jit(touch, **make_pair(contact_model, layout.n, real, jit)._asdict())
+    pair = make_pair(contact_model, layout.n, real, jit)._asdict()
+    return jit(touch, **pair, relative=make_motion(real, moving).relative)
+
+
+def told_apart(layout: Layout, contact_model: str, moving: bool) -> Layout:
+    """Return a layout of this contact model and motion's own.
+
+    Code on disk is found by the closure: what differs only in its callees must differ in the layout too.
+    """
+    return layout._replace(source=layout.source + CONTACT_MODELS.index(contact_model) + len(CONTACT_MODELS) * moving)

@@ -1,6 +1,8 @@
 """PyElastica itself is a backend too: each arm in a simulator of its own, one after the other, on one core."""
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from softgm_bench.errors import UserError
@@ -53,11 +55,13 @@ class PyElasticaBackend:
         cylinders: Cylinders | None = None,
         active: Tensor | None = None,
         substeps: int | None = None,
+        cylinder_velocity: Tensor | None = None,
     ) -> RodState:
         """Advance every rod by one control step.
 
-        A simulator is built where cylinders are met for the first time and kept while they are met. It is told each
-        rod's state before the step, so rods among the same cylinders share it.
+        A simulator is built where cylinders of some lengths, radii and directions are met for the first time and kept
+        while they are met. It is told before the step where they are, how they move and each rod's state, so rods among
+        such cylinders share it.
 
         Args:
             state: not changed; float64 on the CPU.
@@ -66,6 +70,8 @@ class PyElasticaBackend:
             cylinders: what the rods may touch.
             active: ``(num_envs,)`` bool; rods that are not come back as they were.
             substeps: of this step, the parameters' number by default.
+            cylinder_velocity: with which the cylinders move on from where they are now, m/s, without turning,
+                ``(num_envs, n_cylinders, 3)``; constant in the step. By default they stand still.
 
         Returns:
             A new state.
@@ -74,7 +80,7 @@ class PyElasticaBackend:
             ValueError: if the arguments' shapes do not fit together, the state is not float64 on the CPU, or a gradient
                 is asked for.
         """
-        check_inputs(self.parameters, state, couple, force, cylinders, active)
+        check_inputs(self.parameters, state, couple, force, cylinders, active, cylinder_velocity)
         refuse_gradients("pyelastica", state, couple, force)
         if state.position.dtype != torch.float64 or state.position.device.type != "cpu":
             raise ValueError(
@@ -85,13 +91,17 @@ class PyElasticaBackend:
         num_envs = len(couple)
         rows = range(num_envs) if active is None else active.nonzero().flatten().tolist()
         posts = {row: () if cylinders is None else self._oracle.posts_of(cylinders, row) for row in rows}
-        self._arms = {met: self._arms.get(met) or self._oracle.Arm(self.parameters, met) for met in posts.values()}
+        shapes = {row: tuple(post._replace(start=(0.0, 0.0, 0.0)) for post in met) for row, met in posts.items()}
+        self._arms = {
+            met: self._arms.get(met) or self._oracle.Arm(self.parameters, met, carried=True) for met in shapes.values()
+        }
         self.contact_force = torch.zeros(num_envs, dtype=torch.float64)
         couples = couple.detach().double().numpy()
         forces = None if force is None else force.detach().double().numpy()
         with self._oracle.watched_pruning(self._pruning) as watched:
             for row, met in posts.items():
-                arm = self._arms[met]
+                arm = self._arms[shapes[row]]
+                arm.carry([post.start for post in met], _velocity(cylinders, cylinder_velocity, row))
                 fields = [field[row].numpy() for field in (new.position, new.director, new.velocity, new.omega)]
                 for theirs, ours in zip(arm.state, fields, strict=True):
                     theirs[...] = ours
@@ -101,3 +111,11 @@ class PyElasticaBackend:
                     ours[...] = theirs
         self.missed += watched.missed
         return new
+
+
+def _velocity(cylinders: Cylinders | None, velocity: Tensor | None, row: int) -> NDArray[np.float64]:
+    """Velocities of the cylinders that exist in one environment, m/s, ``(posts, 3)``."""
+    if cylinders is None or velocity is None:
+        count = 0 if cylinders is None else int(cylinders.mask[row].sum())
+        return np.zeros((count, 3))
+    return velocity[row][cylinders.mask[row]].detach().double().numpy()

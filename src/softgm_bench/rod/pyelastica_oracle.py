@@ -24,7 +24,7 @@ ROUNDING = 1e-4  # m by which a cylinder must be out of reach, far more than wha
 
 
 class Post(NamedTuple):
-    """A post is one fixed cylinder: the centre of one end, the unit vector to the other, length and radius, in m."""
+    """A post is one cylinder: the centre of one end, the unit vector to the other, length and radius, in m."""
 
     start: tuple[float, float, float]
     axis: tuple[float, float, float]
@@ -75,6 +75,38 @@ class _Given(ea.NoForces):
 
     def apply_torques(self, system, time=0.0):
         system.external_torques += self.loads.couple
+
+
+class Carriage:
+    """A cylinder's centre was at ``centre`` (3,) in m at ``time`` in s and moves at ``velocity`` (3,) in m/s."""
+
+    def __init__(self, post: Post) -> None:
+        """Begin at rest."""
+        self.post, self.time = post, np.float64(0.0)
+        self.put(np.array(post.start), np.zeros(3), self.time)
+
+    def put(self, start: Array, velocity: Array, time: np.float64) -> None:
+        """Be with the post's start at ``start`` at this time, and go on at this velocity."""
+        self.centre = start + np.array(self.post.axis) * self.post.length / 2
+        self.velocity, self.time = velocity, time
+
+
+class _Carried(ea.ConstraintBase):
+    """The cylinder is where its carriage is and never turns."""
+
+    def __init__(self, carriage: Carriage, **kwargs):
+        super().__init__(**kwargs)
+        self.carriage, self.director = carriage, self.system.director_collection.copy()
+
+    def constrain_values(self, system, time):
+        c = self.carriage
+        system.position_collection[..., 0] = c.centre + (time - c.time) * c.velocity
+        system.director_collection[...] = self.director
+        self.constrain_rates(system, time)  # contact, which comes next, sees the velocity of this step
+
+    def constrain_rates(self, system, time):
+        system.velocity_collection[..., 0] = self.carriage.velocity
+        system.omega_collection[...] = 0.0
 
 
 class _LargestContactForce(ea.NoForces):
@@ -169,11 +201,16 @@ def straight_rod(parameters: RodParameters) -> ea.CosseratRod:
 
 
 def build(
-    parameters: RodParameters, loads: Loads, posts: Sequence[Post] = (), rods: int = 1
+    parameters: RodParameters,
+    loads: Loads,
+    posts: Sequence[Post] = (),
+    rods: int = 1,
+    carriages: Sequence[Carriage] = (),
 ) -> tuple[_Simulator, ea.CosseratRod]:
     """Build a simulator with clamps, dampers, loads and contacts, still to be finalised, and return its first arm too.
 
-    Several ``rods`` stand in the same place under the same loads, touch the same posts and don't see each other.
+    Several ``rods`` stand in the same place under the same loads, touch the same posts and don't see each other. Posts
+    are fixed, or moved by their ``carriages``.
     """
     simulator, arms = _Simulator(), [straight_rod(parameters) for _ in range(rods)]
     for rod in arms:
@@ -187,19 +224,20 @@ def build(
         if any(parameters.gravity):
             simulator.add_forcing_to(rod).using(ea.GravityForces, acc_gravity=np.array(parameters.gravity))
         simulator.add_forcing_to(rod).using(_Given, loads=loads)
-    for post in posts:
-        _add_fixed_cylinder(simulator, arms, post, parameters)
+    for post, carriage in zip(posts, carriages or [None] * len(posts), strict=True):
+        _add_cylinder(simulator, arms, post, carriage, parameters)
     return simulator, arms[0]
 
 
 class Arm:
-    """An arm at rest among fixed posts, in a simulator of its own, is moved by whole control steps."""
+    """An arm at rest among posts, in a simulator of its own, is moved by whole control steps."""
 
-    def __init__(self, parameters: RodParameters, posts: Sequence[Post] = ()) -> None:
-        """Build the simulator."""
+    def __init__(self, parameters: RodParameters, posts: Sequence[Post] = (), carried: bool = False) -> None:
+        """Build the simulator; posts are fixed, or ``carried``."""
         self._parameters = parameters
         self._loads = Loads(np.zeros((3, parameters.n_elements)))
-        self._simulator, self._rod = build(parameters, self._loads, posts)
+        self._carriages = [Carriage(post) for post in posts] if carried else []
+        self._simulator, self._rod = build(parameters, self._loads, posts, carriages=self._carriages)
         self._largest = [0.0]
         if posts:
             weight = np.array(parameters.gravity)[:, None] * self._rod.mass
@@ -216,6 +254,11 @@ class Arm:
         They are its whole state between two steps: what is written into them is where the next step begins.
         """
         return tuple(getattr(self._rod, f"{name}_collection") for name in ("position", "director", "velocity", "omega"))
+
+    def carry(self, start: Sequence[Array | tuple[float, ...]], velocity: Array) -> None:
+        """Put the carried posts' starts somewhere, m, from where they move on, m/s, ``(posts, 3)`` each."""
+        for carriage, at, rate in zip(self._carriages, start, velocity, strict=True):
+            carriage.put(np.array(at), np.array(rate), self._time)
 
     def control_step(self, couple: Array, force: Array | None = None, substeps: int | None = None) -> float:
         """Move by a control step under a couple ``(3, n_elements)`` in N m and a force ``(3, n_nodes)`` in N.
@@ -237,22 +280,32 @@ def simulate(
     posts: Sequence[Post] = (),
     force: Callable[[int], Array] | None = None,
     pruning: bool = False,
+    velocity: Callable[[int], Array] | None = None,
 ) -> History:
     """Run ``steps`` control steps; ``couple(step)`` is ``(3, n_elements)`` and ``force(step)`` ``(3, n_nodes)``.
 
+    ``velocity(step)`` is the posts', m/s, ``(posts, 3)``; without it they stand still.
     PyElastica skips cylinders by bounding boxes, which miss contacts: only with ``pruning`` it does so here.
     """
-    arm, forces, states = Arm(parameters, posts), [], []
+    arm, forces, states = Arm(parameters, posts, carried=velocity is not None), [], []
+    start = np.array([post.start for post in posts])
     with watched_pruning(pruning) as watched:
         for step in range(steps):
+            if velocity is not None:
+                arm.carry(list(start), velocity(step))
+                start = start + parameters.control_dt * velocity(step)
             forces.append(arm.control_step(couple(step), None if force is None else force(step)))
             states.append([array.copy() for array in arm.state])
     position, director, velocity, omega = (np.stack(series) for series in zip(*states, strict=True))
     return History(position, director, velocity, omega, np.array(forces), watched.missed)
 
 
-def _add_fixed_cylinder(
-    simulator: _Simulator, rods: Sequence[ea.CosseratRod], post: Post, parameters: RodParameters
+def _add_cylinder(
+    simulator: _Simulator,
+    rods: Sequence[ea.CosseratRod],
+    post: Post,
+    carriage: Carriage | None,
+    parameters: RodParameters,
 ) -> None:
     axis = np.array(post.axis)
     normal = np.eye(3)[np.abs(axis).argmin()]
@@ -261,7 +314,11 @@ def _add_fixed_cylinder(
         np.array(post.start), axis, normal / np.linalg.norm(normal), post.length, post.radius, density=1000.0
     )
     simulator.append(cylinder)
-    simulator.constrain(cylinder).using(ea.OneEndFixedBC, constrained_position_idx=(0,), constrained_director_idx=(0,))
+    if carriage is None:
+        base = {"constrained_position_idx": (0,), "constrained_director_idx": (0,)}
+        simulator.constrain(cylinder).using(ea.OneEndFixedBC, **base)
+    else:
+        simulator.constrain(cylinder).using(_Carried, carriage=carriage)
     for rod in rods:
         simulator.detect_contact_between(rod, cylinder).using(
             ea.RodCylinderContact,

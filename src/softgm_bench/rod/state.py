@@ -26,7 +26,9 @@ class RodState(TensorClass):
 
 
 class Cylinders(TensorClass):
-    """These are fixed rigid cylinders, padded to one number per environment; ``batch_size`` is ``(num_envs,)``.
+    """These are rigid cylinders, padded to one number per environment; ``batch_size`` is ``(num_envs,)``.
+
+    They stand still, or move as the ``cylinder_velocity`` of a control step says.
 
     Attributes:
         start: centre of one end, m, ``(num_envs, n_cylinders, 3)``.
@@ -100,6 +102,7 @@ def check_inputs(
     force: Tensor | None,
     cylinders: Cylinders | None,
     active: Tensor | None,
+    cylinder_velocity: Tensor | None = None,
 ) -> None:
     """Refuse arguments that do not fit together before any kernel reads them.
 
@@ -107,6 +110,9 @@ def check_inputs(
         ValueError: naming the first argument whose shape is wrong, and the right one.
     """
     num_envs, n = state.position.shape[0], parameters.n_elements
+    if cylinder_velocity is not None and cylinders is None:
+        raise ValueError("cylinder_velocity is given without cylinders: it is theirs, so give both")
+    n_cylinders = 0 if cylinders is None else cylinders.mask.shape[-1]
     expected = {
         "state.position": (state.position, (num_envs, 3, n + 1)),
         "state.director": (state.director, (num_envs, 3, 3, n)),
@@ -116,6 +122,7 @@ def check_inputs(
         "force": (force, (num_envs, 3, n + 1)),
         "active": (active, (num_envs,)),
         "cylinders.mask": (None if cylinders is None else cylinders.mask, (num_envs, -1)),
+        "cylinder_velocity": (cylinder_velocity, (num_envs, n_cylinders, 3)),
     }
     for name, (tensor, shape) in expected.items():
         if tensor is None:

@@ -53,6 +53,21 @@ class Geometry(NamedTuple):
     voronoi_dilatation: Tensor
 
 
+class Obstacles(NamedTuple):
+    """These are the cylinders as a control step begins and, where they move, their constant velocity in it, m/s."""
+
+    cylinders: Cylinders
+    velocity: Tensor | None
+
+    def at(self, time: float) -> Cylinders:
+        """Give the cylinders ``time`` s into the step."""
+        if self.velocity is None:
+            return self.cylinders
+        moved = self.cylinders.copy()
+        moved.start = self.cylinders.start + time * self.velocity
+        return moved
+
+
 class TorchBackend:
     """This backend moves rods by position Verlet with a clamped base, analytical damping and contact.
 
@@ -87,6 +102,7 @@ class TorchBackend:
         cylinders: Cylinders | None = None,
         active: Tensor | None = None,
         substeps: int | None = None,
+        cylinder_velocity: Tensor | None = None,
     ) -> RodState:
         """Advance by one control step, with loads held constant.
 
@@ -97,6 +113,8 @@ class TorchBackend:
             cylinders: obstacles, of the same ``num_envs``.
             active: bool, ``(num_envs,)``; environments where it is False come back unchanged, bit for bit.
             substeps: Verlet steps of ``parameters.dt``; ``parameters.substeps`` by default.
+            cylinder_velocity: with which the cylinders move on from where they are now, m/s, without turning,
+                ``(num_envs, n_cylinders, 3)``; constant in the step. By default they stand still.
 
         Returns:
             A new state.
@@ -104,10 +122,11 @@ class TorchBackend:
         Raises:
             ValueError: if the arguments' shapes do not fit together.
         """
-        check_inputs(self.parameters, state, couple, force, cylinders, active)
+        check_inputs(self.parameters, state, couple, force, cylinders, active, cylinder_velocity)
         motion = Motion(state.position, state.director, state.velocity, state.omega)
+        obstacles = _obstacles(cylinders, cylinder_velocity)
         if active is None:
-            moved = self._advance(motion, couple, force, cylinders, substeps)
+            moved = self._advance(motion, couple, force, obstacles, substeps)
         else:
             # Resting environments aren't computed at all: one that has diverged can't poison gradients.
             chosen = active.nonzero().squeeze(-1)
@@ -115,31 +134,36 @@ class TorchBackend:
                 Motion(*(old[chosen] for old in motion)),
                 couple[chosen],
                 None if force is None else force[chosen],
-                None if cylinders is None else cylinders[chosen],
+                None if obstacles is None else Obstacles(*(x if x is None else x[chosen] for x in obstacles)),
                 substeps,
             )
             moved = Motion(*(old.index_put((chosen,), new) for old, new in zip(motion, moved, strict=True)))
         return RodState(**moved._asdict(), batch_size=state.batch_size)
 
     def _advance(
-        self, motion: Motion, couple: Tensor, force: Tensor | None, cylinders: Cylinders | None, substeps: int | None
+        self, motion: Motion, couple: Tensor, force: Tensor | None, obstacles: Obstacles | None, substeps: int | None
     ) -> Motion:
         """``control_step`` on plain tensors, every environment moving."""
         constants = self._constants_like(motion.position)
         external_force = constants.weight if force is None else constants.weight + force
 
-        def segment(count: int, motion: Motion, couple: Tensor, force: Tensor, cylinders: Cylinders | None) -> Motion:
-            for _ in range(count):
-                motion = self._substep(motion, constants, couple, force, cylinders)
+        def segment(
+            begun: int, end: int, motion: Motion, couple: Tensor, force: Tensor, obstacles: Obstacles | None
+        ) -> Motion:
+            for substep in range(begun, end):
+                # contact acts in the middle of a substep
+                cylinders = None if obstacles is None else obstacles.at((substep + 0.5) * self.parameters.dt)
+                velocity = None if obstacles is None else obstacles.velocity
+                motion = self._substep(motion, constants, couple, force, cylinders, velocity)
             return motion
 
         substeps = self.parameters.substeps if substeps is None else substeps
         if self.checkpoint_every is None or not torch.is_grad_enabled():
-            motion = segment(substeps, motion, couple, external_force, cylinders)
+            motion = segment(0, substeps, motion, couple, external_force, obstacles)
         else:
             for begun in range(0, substeps, self.checkpoint_every):
-                count = min(self.checkpoint_every, substeps - begun)
-                motion = _recomputed(partial(segment, count), motion, couple, external_force, cylinders)
+                end = min(begun + self.checkpoint_every, substeps)
+                motion = _recomputed(partial(segment, begun, end), motion, couple, external_force, obstacles)
         if motion.director.dtype == torch.float32:
             motion = motion._replace(director=straightened(motion.director))
         return motion
@@ -151,6 +175,7 @@ class TorchBackend:
         couple: Tensor,
         external_force: Tensor,
         cylinders: Cylinders | None,
+        cylinder_velocity: Tensor | None,
     ) -> Motion:
         """One position-Verlet step in the order of PyElastica's ``SymplecticStepperMixin.step``."""
         dt = self.parameters.dt
@@ -162,7 +187,9 @@ class TorchBackend:
         if cylinders is not None:
             radius = element_radius(motion.position, constants.volume)
             contact = _CONTACT_FORCES[self.parameters.contact_model]
-            force = force + contact(motion.position, motion.velocity, radius, cylinders, self.parameters)
+            force = force + contact(
+                motion.position, motion.velocity, radius, cylinders, self.parameters, cylinder_velocity
+            )
         torque = internal_torques(motion, stress, now, constants) + couple
 
         motion = dynamic_step(motion, force, torque, now.dilatation, constants, dt)
@@ -212,17 +239,31 @@ class _Recomputed(torch.autograd.Function):
         return (None, *(next(found) if need else None for need in needed))
 
 
+def _obstacles(cylinders: Cylinders | None, velocity: Tensor | None) -> Obstacles | None:
+    if cylinders is None or velocity is None:
+        return None if cylinders is None else Obstacles(cylinders, None)
+    # what a masked cylinder holds may be anything, and a NaN in a discarded branch still poisons gradients
+    return Obstacles(cylinders, torch.where(cylinders.mask[..., None], velocity, 0.0))
+
+
 def _recomputed(
-    segment: Callable[..., Motion], motion: Motion, couple: Tensor, force: Tensor, cylinders: Cylinders | None
+    segment: Callable[..., Motion], motion: Motion, couple: Tensor, force: Tensor, obstacles: Obstacles | None
 ) -> Motion:
     """``segment`` of the other arguments with gradients for each of them, through ``_Recomputed``."""
-    shapes = () if cylinders is None else (cylinders.start, cylinders.axis, cylinders.length, cylinders.radius)
+    shapes: tuple[Tensor, ...] = ()
+    if obstacles is not None:
+        cylinders, velocity = obstacles
+        shapes = (cylinders.start, cylinders.axis, cylinders.length, cylinders.radius)
+        shapes += () if velocity is None else (velocity,)
 
     def run(*inputs: Tensor) -> Motion:
-        obstacles = None
-        if cylinders is not None:
-            obstacles = Cylinders(*inputs[6:], mask=cylinders.mask, batch_size=cylinders.batch_size)
-        return segment(Motion(*inputs[:4]), inputs[4], inputs[5], obstacles)
+        seen = None
+        if obstacles is not None:
+            mask, size = obstacles.cylinders.mask, obstacles.cylinders.batch_size
+            seen = Obstacles(
+                Cylinders(*inputs[6:10], mask=mask, batch_size=size), inputs[10] if len(inputs) > 10 else None
+            )
+        return segment(Motion(*inputs[:4]), inputs[4], inputs[5], seen)
 
     return Motion(*_Recomputed.apply(run, *motion, couple, force, *shapes))
 
