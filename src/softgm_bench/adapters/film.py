@@ -69,18 +69,20 @@ class Film:
     def _note_state(self, td: TensorDictBase) -> None:
         rod = self._arm.rod
         now = {name: getattr(rod, name) for name in ("position", "director", "velocity", "omega")}
-        now |= {"contact": self._arm.contacts()}
+        now |= {"contact": self._arm.contacts(), "starts": self._arm.scene.cylinders.start}
         now |= {"slots/active": td[entries.SLOT_ACTIVE], "slots/descriptor": td[entries.SLOT_DESCRIPTOR]}
         for name, values in now.items():
             self._states.setdefault(name, []).append(_first_row(values))
 
     def _trajectory(self) -> Any:
-        from softgm_bench.episodes.trajectory import CYLINDER_FIELDS, Trajectory
+        from softgm_bench.episodes.trajectory import CYLINDER_FIELDS, PATH, Trajectory
 
         assert self._td is not None
         arm, cylinders = self._arm, self._arm.scene.cylinders
         exists = _first_row(cylinders.mask)
         states = {name: np.stack(values) for name, values in self._states.items()}
+        path = states.pop("starts")[:, exists].astype(float)
+        shapes = {name: _first_row(getattr(cylinders, name))[exists].astype(float) for name in CYLINDER_FIELDS}
         steps = len(self._steps["reward"])
         shapes = {"action": (steps, arm.sizes.n_agents, arm.sizes.action), "tip_force": (steps, 3), "reward": (steps,)}
         return Trajectory(
@@ -89,7 +91,7 @@ class Film:
             **{name: np.array(values).reshape(shapes[name]) for name, values in self._steps.items()},
             target=_first_row(arm.scene.target).astype(np.float64),
             reward_terms={},
-            cylinders={name: _first_row(getattr(cylinders, name))[exists].astype(float) for name in CYLINDER_FIELDS},
+            cylinders=shapes | ({"start": path[0], PATH: path} if arm.task.moves else {}),
             attention={},
             success=bool(self._td[entries.SUCCESS]),
             diverged=bool(self._td[entries.DIVERGED]),

@@ -37,6 +37,8 @@ class Episodes(TensorClass):
         scene: target and cylinders.
         bins: the cylinders cut into bins.
         table: discovered bins.
+        shown: descriptors of the slots' bins as they were last sensed, ``(num_envs, n_slots, 9)`` float32; without
+            slots where nothing moves.
         previous_action: as the sections applied it, ``(num_envs, n_agents, 2)`` float32; 0 after a reset.
         steps: control steps since the reset, ``(num_envs,)`` int64.
         contact_steps: those of them that ended in contact, where the task limits them, ``(num_envs,)`` int64.
@@ -49,6 +51,7 @@ class Episodes(TensorClass):
     scene: Scene
     bins: Bins
     table: SlotTable
+    shown: Tensor
     previous_action: Tensor
     steps: Tensor
     contact_steps: Tensor
@@ -92,6 +95,7 @@ class Beginning(NamedTuple):
 
     rod: RodState
     table: SlotTable
+    shown: Tensor
     previous_action: Tensor
     never: Tensor
     whole: Tensor
@@ -238,13 +242,14 @@ class Simulator:
         config = self.task.config
         level = difficulty(progress, config.curriculum) if self.curriculum else None
         scene = self.task.sample(count, self._generator, level).apply(self._real)
-        bins = cut_into_bins(scene.cylinders, config.bin_length, self.task.max_cylinder_length)
+        bins = self._cut(scene)
         blank = self._blank(count)
         episodes = Episodes(
             rod=blank.rod,
             scene=scene,
             bins=bins,
             table=blank.table,
+            shown=blank.shown,
             previous_action=blank.previous_action,
             steps=blank.table.count,
             contact_steps=blank.table.count,
@@ -254,7 +259,7 @@ class Simulator:
             batch_size=[count],
         )
         sight = self.sense(episodes)
-        episodes.table = sight.table
+        self._note(episodes, sight)
         return episodes, sight
 
     def _blank(self, count: int) -> Beginning:
@@ -264,6 +269,7 @@ class Simulator:
         blank = Beginning(
             rod=straight_rods(self.backend.parameters, count, self.dtype, self.device),
             table=empty_table(count, self.n_slots, self._n_bins, self.device),
+            shown=torch.zeros((count, self.n_slots * self.task.moves, 9), dtype=torch.float32, device=self.device),
             previous_action=torch.zeros(
                 (count, self.task.config.n_agents, DIRECTIONS), dtype=torch.float32, device=self.device
             ),
@@ -302,14 +308,17 @@ class Simulator:
                     state.tip_force.unsqueeze(-1), (self.backend.parameters.n_elements, 0)
                 )  # on the last node
         cylinders = now.scene.cylinders if self.task.max_cylinders else None
+        velocity = self._move_cylinders(now, active) if self.task.moves else None
         couple = self._actuation.couple(action)
-        moved = self.backend.control_step(rod, couple, force=force, cylinders=cylinders, active=active)
+        moved = self.backend.control_step(
+            rod, couple, force=force, cylinders=cylinders, active=active, cylinder_velocity=velocity
+        )
         broken = diverged(moved, self._rest_length, config.min_dilatation, config.max_dilatation)
         if sync.any_true(broken):
             moved = rod.where(broken, moved)
         now.rod, now.previous_action = moved, action
         sight = self.sense(now)
-        now.table = sight.table
+        self._note(now, sight)
         step = Step(
             before=rod.position,
             after=moved.position,
@@ -331,13 +340,40 @@ class Simulator:
             state.progress = note_ends(state.progress, verdict.ended, verdict.success, config.curriculum)
         return Outcome(sight=sight, broken=broken, verdict=verdict)
 
+    def _move_cylinders(self, episodes: Episodes, active: Tensor) -> Tensor:
+        """Bring the scenes of active environments to the end of this control step; bins keep their numbers.
+
+        Returns:
+            With which velocity the cylinders move there, m/s, ``(num_envs, n_cylinders, 3)``.
+        """
+        scene, duration = episodes.scene, self.backend.parameters.control_dt
+        episodes.scene = self.task.advance(scene, episodes.steps, duration).where(active, scene)
+        episodes.bins = self._cut(episodes.scene)
+        return (episodes.scene.cylinders.start - scene.cylinders.start) / duration
+
+    def _cut(self, scene: Scene) -> Bins:
+        return cut_into_bins(scene.cylinders, self.task.config.bin_length, self.task.max_cylinder_length)
+
     # readings
 
     def sense(self, episodes: Episodes) -> Sight:
-        """Sense, discover and observe obstacles from the agents' places."""
+        """Sense, discover and observe obstacles from the agents' places.
+
+        A bin that nobody senses now is shown as it was last sensed: nobody knows where it has moved.
+        """
         config, scene = self.task.config, episodes.scene
         position = self.at_agents(episodes.rod.position)
-        return look(position, scene.cylinders, episodes.bins, episodes.table, config.sensing_radius, config.bin_length)
+        sight = look(position, scene.cylinders, episodes.bins, episodes.table, config.sensing_radius, config.bin_length)
+        if not self.task.moves:
+            return sight
+        sensed = sight.edge.any(dim=1).unsqueeze(-1)
+        return sight._replace(descriptor=torch.where(sensed, sight.descriptor, episodes.shown))
+
+    def _note(self, episodes: Episodes, sight: Sight) -> None:
+        """Remember what has been discovered and how it was shown."""
+        episodes.table = sight.table
+        if self.task.moves:
+            episodes.shown = sight.descriptor
 
     def at_agents(self, of_nodes: Tensor) -> Tensor:
         """Select the agents' nodes: ``(num_envs, 3, n_nodes)`` to ``(num_envs, n_agents, 3)``."""

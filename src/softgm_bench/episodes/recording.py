@@ -18,7 +18,7 @@ from softgm_bench.envs import SoftArmEnv, entries, kind_of
 from softgm_bench.episodes import policy, trajectory
 from softgm_bench.episodes.evaluation import act, evaluation_seed
 from softgm_bench.episodes.policy import TrainedPolicy
-from softgm_bench.episodes.trajectory import CYLINDER_FIELDS, ROD, Array, Trajectory
+from softgm_bench.episodes.trajectory import CYLINDER_FIELDS, PATH, ROD, Array, Trajectory
 from softgm_bench.errors import UserError
 from softgm_bench.rod.backend import default_backend, runs_on
 from softgm_bench.storage.versions import versions
@@ -121,6 +121,7 @@ class _Recorder:
         self.observation: dict[str, list[Array]] = {}
         self.terms: dict[str, list[Array]] = {name: [] for name in entries.REWARD_TERM_NAMES}
         self.attention: dict[str, list[Array]] = {}
+        self.path: list[Array] = []
         self.success = self.diverged = False
 
     def state(self, data: TensorDictBase) -> None:
@@ -129,6 +130,7 @@ class _Recorder:
         for name in ROD:
             self.states[name].append(self._own(getattr(rod, name)))
         self.states["contact"].append(self._own(self.env.contacts()))
+        self.path.append(self._own(self.env.scene.cylinders.start).astype(np.float64))
         for key in OBSERVED:
             values = data.get(key, None)
             if values is not None:
@@ -155,14 +157,14 @@ class _Recorder:
         """Give what was collected."""
         cylinders = self.env.scene.cylinders
         exists = self._own(cylinders.mask)
+        path = np.stack(self.path)[:, exists]
+        shapes = {name: self._own(getattr(cylinders, name))[exists].astype(np.float64) for name in CYLINDER_FIELDS}
         return Trajectory(
             **{name: np.stack(values) for name, values in (self.states | self.steps).items()},
             target=self._own(self.env.scene.target).astype(np.float64),
             observation={name: np.stack(values) for name, values in self.observation.items()},
             reward_terms={name: np.stack(values) for name, values in self.terms.items()},
-            cylinders={
-                name: self._own(getattr(cylinders, name))[exists].astype(np.float64) for name in CYLINDER_FIELDS
-            },
+            cylinders=shapes | ({"start": path[0], PATH: path} if self.env.task.moves else {}),
             attention={stage: np.stack(values) for stage, values in self.attention.items()},
             success=self.success,
             diverged=self.diverged,

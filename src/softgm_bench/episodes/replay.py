@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from softgm_bench.episodes.trajectory import ROD, Array, Trajectory
+from softgm_bench.episodes.trajectory import CYLINDER_FIELDS, PATH, ROD, Array, Trajectory
 from softgm_bench.errors import UserError
 from softgm_bench.rod import backend as rod_backend
 from softgm_bench.rod.actuation import Actuation
@@ -105,7 +105,7 @@ def _replayed(
 ) -> Replay:
     """Move the arm; in the recording's type unless ``dtype`` says another. ``note`` is called after each step."""
     dtype = dtype or torch.from_numpy(trajectory.position).dtype
-    couple, force, cylinders = _couple(trajectory, dtype), _force(trajectory), _cylinders(trajectory, dtype)
+    couple, force = _couple(trajectory, dtype), _force(trajectory)
     task = trajectory.config["task"]
     rest_length = torch.as_tensor(rod_constants(trajectory.rod).rest_length, dtype=dtype)
     first = {name: torch.from_numpy(getattr(trajectory, name)[:1].copy()).to(dtype) for name in ROD}
@@ -115,7 +115,10 @@ def _replayed(
         if watch is not None:
             watch()
         push = None if force is None else torch.from_numpy(force(step)).to(dtype).unsqueeze(0)
-        moved = backend.control_step(state, couple(step), force=push, cylinders=cylinders)
+        cylinders, velocity = _cylinders(trajectory, step, dtype)
+        moved = backend.control_step(
+            state, couple(step), force=push, cylinders=cylinders, cylinder_velocity=velocity
+        )
         if note is not None:
             note()
         # the environment keeps the last state of an arm whose simulation breaks
@@ -153,9 +156,17 @@ def _force(trajectory: Trajectory) -> Callable[[int], NDArray[np.float64]] | Non
     return force
 
 
-def _cylinders(trajectory: Trajectory, dtype: torch.dtype) -> Cylinders | None:
+def _cylinders(
+    trajectory: Trajectory, step: int, dtype: torch.dtype
+) -> tuple[Cylinders | None, torch.Tensor | None]:
+    """Cylinders as a step begins and, where they move, their velocity in it, as the environment computed it, m/s."""
     count = len(trajectory.cylinders["start"])
     if count == 0:
-        return None
-    fields = {name: torch.from_numpy(values).to(dtype).unsqueeze(0) for name, values in trajectory.cylinders.items()}
-    return Cylinders(**fields, mask=torch.ones((1, count), dtype=torch.bool), batch_size=[1])
+        return None, None
+    given = trajectory.cylinders | {"start": trajectory.starts(step)}
+    fields = {name: torch.from_numpy(given[name]).to(dtype).unsqueeze(0) for name in CYLINDER_FIELDS}
+    cylinders = Cylinders(**fields, mask=torch.ones((1, count), dtype=torch.bool), batch_size=[1])
+    if PATH not in given:
+        return cylinders, None
+    following = torch.from_numpy(trajectory.starts(step + 1)).to(dtype).unsqueeze(0)
+    return cylinders, (following - cylinders.start) / trajectory.rod.control_dt

@@ -18,6 +18,7 @@ from softgm_bench.storage.files import read_where_asked, write_where_asked
 
 FORMAT = 1
 CYLINDER_FIELDS = ("start", "axis", "length", "radius")
+PATH = "path"  # of cylinders that move
 # Members of a file, besides the groups: those of the rod have its type, float64 or float32.
 ROD = ("position", "director", "velocity", "omega")
 ARRAYS = (*ROD, "contact", "action", "tip_force", "reward", "target")
@@ -43,7 +44,8 @@ class Trajectory:
         target: m, ``(3,)`` float64.
         observation: what the policy was shown, by key joined with "/": ``(T + 1, ...)``.
         reward_terms: by name, ``(T,)`` float32.
-        cylinders: ``start`` (C, 3), ``axis`` (C, 3), ``length`` (C,), ``radius`` (C,) of the C that exist, float64, m.
+        cylinders: ``start`` (C, 3), ``axis`` (C, 3), ``length`` (C,), ``radius`` (C,) of the C that exist, float64, m;
+            where they move also ``path`` (T + 1, C, 3), their starts at each state, of which ``start`` is the first.
         attention: empty, or ``stage1`` ``(T, L, H, N, N + M)`` and ``stage2`` ``(T, L, H, N, N)`` float32.
         success: whether the tip reached the target.
         diverged: whether the simulation broke in the last step; its state is then that before the step.
@@ -99,6 +101,9 @@ class Trajectory:
         for name, shape in zip(CYLINDER_FIELDS, ((count, 3), (count, 3), (count,), (count,)), strict=True):
             if self.cylinders[name].shape != shape:
                 raise ValueError(f"cylinders/{name} has shape {self.cylinders[name].shape}: it must be {shape}")
+        path = self.cylinders.get(PATH)
+        if path is not None and path.shape != (steps + 1, count, 3):
+            raise ValueError(f"cylinders/{PATH} has shape {path.shape}: it must be {(steps + 1, count, 3)}")
 
     @property
     def steps(self) -> int:
@@ -121,6 +126,15 @@ class Trajectory:
         """Index of each agent's node, ``(N,)``."""
         rod = self.rod
         return np.round(control_points(self.n_agents, rod.base_length) * (rod.n_elements / rod.base_length)).astype(int)
+
+    def starts(self, step: float) -> NDArray[np.float64]:
+        """Starts of the cylinders at a time in control steps, m, ``(C, 3)``: between two steps on a straight line."""
+        path = self.cylinders.get(PATH)
+        if path is None:
+            return self.cylinders["start"]
+        k = min(int(step), self.steps)
+        part = step - k
+        return path[k] if part == 0.0 else (1.0 - part) * path[k] + part * path[k + 1]
 
     def radius(self) -> NDArray[np.float64]:
         """Radius of every element, m, ``(T + 1, n_elements)``: an element keeps its volume when it is stretched."""

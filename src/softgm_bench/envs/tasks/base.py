@@ -147,6 +147,7 @@ class Task(ABC):
         max_cylinder_length: the longest cylinder of any scene, m; 0 where there is none.
         n_privileged: numbers in a scene's ``privileged``.
         n_points: points among them, m; the first ``3 n_points`` numbers are their coordinates.
+        moves: whether cylinders move, by ``advance``.
     """
 
     config_class: ClassVar[type[TaskConfig]]
@@ -154,6 +155,7 @@ class Task(ABC):
     max_cylinder_length: float = 0.0
     n_privileged: int = 0
     n_points: int = 0
+    moves: bool = False
 
     def __init__(self, config: Any) -> None:
         """Keep the configuration."""
@@ -170,6 +172,24 @@ class Task(ABC):
                 configurations with ``curriculum.enabled``. None and 1 give the same scenes from the same generator
                 state, bit by bit, which may differ in the number of masked cylinders behind the others.
         """
+
+
+    def advance(self, scene: Scene, step: Tensor, duration: float) -> Scene:
+        """Give the scenes one control step later, where the task ``moves`` cylinders.
+
+        From where a cylinder starts in one to where it starts in the other it moves on a straight line at a constant
+        speed, and contact is damped against that velocity. All that motion depends on is in the scene, as in its
+        ``privileged``, or follows from the step.
+
+        Args:
+            scene: as it is now, not to be changed in place, floating numbers in the simulation's type.
+            step: control steps since the episodes began, ``(num_envs,)`` int64; staggered ones began at any.
+            duration: of a control step, s.
+
+        Returns:
+            Scenes that differ in the cylinders' ``start`` and in ``privileged`` alone: nothing turns or grows.
+        """
+        return scene
 
 
 def eased(easy: Sequence[float], own: Sequence[float], difficulty: Tensor | None) -> Bounds:
