@@ -1,3 +1,5 @@
 """The tasks that have an arm."""
 
-TASKS = ("basic", "structured", "wall", "wall_narrow", "wall_fixed", "wall_touch", "wall_search", "wall_decoy")
+STILL = ("basic", "structured", "wall", "wall_narrow", "wall_fixed", "wall_touch", "wall_search", "wall_decoy")
+MOVING = ("wall_sliding", "swinging_posts")
+TASKS = STILL + MOVING

@@ -79,6 +79,7 @@ def _certify(arguments: list[str]) -> None:
     from softgm_bench.certification.bench import to_tensor
     from softgm_bench.certification.search import described, run
     from softgm_bench.envs import kind_of
+    from softgm_bench.envs.tasks import TASKS
     from softgm_bench.episodes import certified
     from softgm_bench.runs.machine import keep_memory, set_threads
 
@@ -87,6 +88,8 @@ def _certify(arguments: list[str]) -> None:
     config = configure(["recipe=paper", *overrides])
     if not kind_of(config.task).has_arm:
         raise UserError(f"task={config.task.name}: there is no arm in it")
+    if TASKS[config.task.name].moves:
+        raise UserError(f"task={config.task.name}: its obstacles move; scenes are certified where they stand still")
     path = Path(options.out or certified.FOLDER / f"{config.task.name}.npz")
     bench, judge = (Bench(config, options.episodes, options.seed, dtype) for dtype in ("float32", "float64"))
     search = Search(bench, judge, options.steps, options.seed)

@@ -10,13 +10,13 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from dense import force_dense
+from every_task import TASKS
 from softgm_bench.assembly import configure
 from softgm_bench.envs.curriculum import difficulty, first_progress, note_ends
 from softgm_bench.envs.tasks import make_task
 from softgm_bench.envs.tasks.base import CurriculumConfig, eased
 from softgm_bench.errors import UserError
 
-TASKS = ("basic", "structured", "wall", "wall_narrow", "wall_fixed", "wall_touch", "wall_search", "wall_decoy")
 ENABLED = "task.curriculum.enabled=true"
 FOUR = CurriculumConfig(enabled=True, stages=2, episodes=4, promote=0.6, demote=0.2)
 

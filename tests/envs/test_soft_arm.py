@@ -2,11 +2,11 @@ import pytest
 import torch
 from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type, step_mdp
 
+from every_task import TASKS
 from softgm_bench.envs import entries, make_env
 from softgm_bench.models.heads import build_actor
 from softgm_bench.rod.parameters import RodParameters
 
-TASKS = ("basic", "structured", "wall", "wall_narrow", "wall_fixed", "wall_touch", "wall_search", "wall_decoy")
 SHORT = RodParameters(substeps=10)  # a tenth of a control step: these tests are about the environment
 
 

@@ -51,9 +51,7 @@ def _compiler() -> None:
         pytest.skip(cuda_code.why_not())
 
 
-def assembled(
-    n_elements: int, real: type, contact: str | None, folder: Path, moving: bool = False
-) -> dict[str, int]:
+def assembled(n_elements: int, real: type, contact: str | None, folder: Path, moving: bool = False) -> dict[str, int]:
     return cuda_code.assembled(ptx(n_elements, real, contact, moving), folder, most_registers(n_elements, real))
 
 

@@ -45,8 +45,8 @@ def parallel_env(
     """Build one arm with settings from ``conf/``.
 
     Args:
-        task: ``basic``, ``structured``, ``wall``, ``wall_narrow``, ``wall_fixed``, ``wall_touch``, ``wall_search`` or
-            ``wall_decoy``.
+        task: ``basic``, ``structured``, ``wall``, ``wall_narrow``, ``wall_fixed``, ``wall_touch``, ``wall_search``,
+            ``wall_decoy``, ``wall_sliding`` or ``swinging_posts``.
         seed: of the scenes until ``reset(seed=...)`` gives another; None: from the operating system.
         render_mode: ``rgb_array`` or None.
         horizon: control steps until truncation, the task's by default.

@@ -116,9 +116,7 @@ def _replayed(
             watch()
         push = None if force is None else torch.from_numpy(force(step)).to(dtype).unsqueeze(0)
         cylinders, velocity = _cylinders(trajectory, step, dtype)
-        moved = backend.control_step(
-            state, couple(step), force=push, cylinders=cylinders, cylinder_velocity=velocity
-        )
+        moved = backend.control_step(state, couple(step), force=push, cylinders=cylinders, cylinder_velocity=velocity)
         if note is not None:
             note()
         # the environment keeps the last state of an arm whose simulation breaks
@@ -156,9 +154,7 @@ def _force(trajectory: Trajectory) -> Callable[[int], NDArray[np.float64]] | Non
     return force
 
 
-def _cylinders(
-    trajectory: Trajectory, step: int, dtype: torch.dtype
-) -> tuple[Cylinders | None, torch.Tensor | None]:
+def _cylinders(trajectory: Trajectory, step: int, dtype: torch.dtype) -> tuple[Cylinders | None, torch.Tensor | None]:
     """Cylinders as a step begins and, where they move, their velocity in it, as the environment computed it, m/s."""
     count = len(trajectory.cylinders["start"])
     if count == 0:

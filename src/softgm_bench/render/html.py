@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from softgm_bench.episodes.trajectory import Trajectory
+from softgm_bench.episodes.trajectory import PATH, Trajectory
 from softgm_bench.render import style
 from softgm_bench.render.camera import FIELD_OF_VIEW, direction
-from softgm_bench.render.scene import Stage
+from softgm_bench.render.scene import Stage, cylinder_of
 from softgm_bench.storage.files import write_where_asked
 
 VIEWER = Path(__file__).with_name("viewer")
@@ -89,6 +89,8 @@ def payload(trajectory: Trajectory) -> dict[str, Any]:
         "terms": _array(np.stack(list(trajectory.reward_terms.values())), np.float32),
         "edge": _bits(trajectory.observation["agents/edge"][..., : len(slots)]),
     }
+    if PATH in cylinders:  # how far each is from where it began
+        packed["shift"] = _rounded(cylinders[PATH] - cylinders["start"], np.uint16)
     if np.any(trajectory.tip_force):
         packed["force"] = _array(trajectory.tip_force, np.float32)
     return {
@@ -121,7 +123,10 @@ def _numbers(values: NDArray) -> list[float]:
 
 
 def _slots(trajectory: Trajectory) -> list[dict[str, Any]]:
-    """Discovered bins in the order of their slots: step of discovery, centre, axis, radius and half length, m."""
+    """Discovered bins in the order of their slots: step of discovery, centre, axis, radius and half length, m.
+
+    Of a bin that moves: its cylinder too, and the centre where both began.
+    """
     active = trajectory.observation["slots/active"]
     used = int(active[-1].sum())  # slots are filled from the front and never emptied
     half_bin = 0.5 * trajectory.config["task"]["bin_length"]
@@ -130,7 +135,12 @@ def _slots(trajectory: Trajectory) -> list[dict[str, Any]]:
         radius, length, middle = _numbers(row[6:])
         half = round(min(half_bin, length * (1.0 - middle)), 6)  # a cylinder's last bin may be shorter
         place = {"centre": _numbers(row[:3]), "axis": _numbers(row[3:6]), "radius": radius, "half": half}
-        slots.append({"step": int(active[:, slot].argmax())} | place)
+        first = int(active[:, slot].argmax())
+        if PATH in trajectory.cylinders:
+            c, along = cylinder_of(trajectory, slot, first)
+            began = trajectory.cylinders["start"][c] + along * trajectory.cylinders["axis"][c]
+            place |= {"cylinder": c, "centre": _numbers(began)}
+        slots.append({"step": first} | place)
     return slots
 
 

@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from softgm_bench.episodes.trajectory import Trajectory
+from softgm_bench.episodes.trajectory import PATH, Trajectory
 from softgm_bench.render import style
 from softgm_bench.render.camera import CORNERS, MANY
 from softgm_bench.render.grid import make_grid
@@ -93,18 +93,21 @@ class Stage:
         self.position = trajectory.position.astype(np.float64)
         self.radius = trajectory.radius()
         cylinders = trajectory.cylinders
-        self.ends = cylinders["start"] + cylinders["length"][:, None] * cylinders["axis"]  # m, (C, 3)
-        self.wall = len(self.ends) >= MANY
+        self.edges = cylinders["length"][:, None] * cylinders["axis"]  # from a cylinder's start to its end, m, (C, 3)
+        path = cylinders.get(PATH)  # of cylinders that move, the corners of the box in which their starts stay
+        self._starts = [cylinders["start"]] if path is None else [path.min(axis=0), path.max(axis=0)]
+        self.wall = len(self.edges) >= MANY
         self.first_seen = _first_seen(trajectory, self.bin_length)
         lowest = [-0.2 * self.base_length, (self.position[:, 2] - rod["base_radius"]).min() - 0.02]
-        self.floor = float(min([*lowest, *cylinders["start"][:, 2], *self.ends[:, 2]]))
+        feet = [z for start in self._starts for z in (*start[:, 2], *(start + self.edges)[:, 2])]
+        self.floor = float(min([*lowest, *feet]))
         self.light = _light_frame(camera_azimuth)
 
     def extent(self) -> Array:
         """Points, m, ``(n, 3)``, that a picture of the whole episode has to show."""
         nodes = self.position[:, :, ::6].transpose(0, 2, 1).reshape(-1, 3)
         radius = self.trajectory.cylinders["radius"][:, None, None] * CORNERS
-        ends = np.stack([self.trajectory.cylinders["start"][:, None] + radius, self.ends[:, None] + radius], axis=1)
+        ends = np.stack([at[:, None] + radius for start in self._starts for at in (start, start + self.edges)], axis=1)
         arm = nodes[:, None] + 0.05 * self.base_length * CORNERS
         target = self.trajectory.target + self.success_radius * CORNERS
         return np.concatenate([[[0.0, 0.0, self.floor]], target, arm.reshape(-1, 3), ends.reshape(-1, 3)])
@@ -165,8 +168,8 @@ class Stage:
         return self.trajectory.success and step >= self.trajectory.steps
 
     def _cylinders(self, parts: Parts, step: float) -> None:
-        cylinders = self.trajectory.cylinders
-        for c, (start, end) in enumerate(zip(cylinders["start"], self.ends, strict=True)):
+        cylinders, starts = self.trajectory.cylinders, self.trajectory.starts(step)
+        for c, (start, end) in enumerate(zip(starts, starts + self.edges, strict=True)):
             known, colour = self._cylinder_colour(c, step)
             opacity = SEEN_THROUGH + (0.8 - SEEN_THROUGH) * known if self.wall else 1.0
             cone = round_cone(start, cylinders["radius"][c], end, cylinders["radius"][c])
@@ -239,17 +242,26 @@ def _light_frame(camera_azimuth: float) -> Array:
 
 def _first_seen(trajectory: Trajectory, bin_length: float) -> list[Array]:
     """For each cylinder, the step at which each of its bins was discovered, infinite if never."""
-    cylinders = trajectory.cylinders
-    start, axis, length = cylinders["start"], cylinders["axis"], cylinders["length"]
+    length = trajectory.cylinders["length"]
     seen = [np.full(max(1, int(np.ceil(one / bin_length - 1e-9))), np.inf) for one in length]
     active = trajectory.observation.get("slots/active", np.zeros((1, 0), dtype=bool))
     for slot in np.flatnonzero(active.any(axis=0)) if seen else ():
         first = int(active[:, slot].argmax())
-        offset = trajectory.observation["slots/descriptor"][first, slot, :3].astype(np.float64) - start
-        along = (offset * axis).sum(axis=1)
-        off_axis = np.linalg.norm(offset - along[:, None] * axis, axis=1)
-        outside = np.maximum(0.0, np.abs(along - 0.5 * length) - 0.5 * length)
-        c = int((off_axis + outside).argmin())
-        index = min(int(along[c] / bin_length), len(seen[c]) - 1)
+        c, along = cylinder_of(trajectory, slot, first)
+        index = min(int(along / bin_length), len(seen[c]) - 1)
         seen[c][index] = min(seen[c][index], first)
     return seen
+
+
+def cylinder_of(trajectory: Trajectory, slot: int, step: int) -> tuple[int, float]:
+    """The cylinder to which the bin that a slot shows at a step belongs, and the bin's place along its axis, m.
+
+    At this step the bin is shown where it is.
+    """
+    axis, length = trajectory.cylinders["axis"], trajectory.cylinders["length"]
+    offset = trajectory.observation["slots/descriptor"][step, slot, :3].astype(np.float64) - trajectory.starts(step)
+    along = (offset * axis).sum(axis=1)
+    off_axis = np.linalg.norm(offset - along[:, None] * axis, axis=1)
+    outside = np.maximum(0.0, np.abs(along - 0.5 * length) - 0.5 * length)
+    c = int((off_axis + outside).argmin())
+    return c, float(along[c])

@@ -173,7 +173,6 @@ class Task(ABC):
                 state, bit by bit, which may differ in the number of masked cylinders behind the others.
         """
 
-
     def advance(self, scene: Scene, step: Tensor, duration: float) -> Scene:
         """Give the scenes one control step later, where the task ``moves`` cylinders.
 

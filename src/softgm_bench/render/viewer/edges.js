@@ -26,14 +26,14 @@ function edgesAt(episode, rod, time, theme, choice, out) {
   if (!Object.keys(episode.attention).length) {
     return episode.slots.flatMap((slot, index) => agents
       .filter((_, agent) => slot.step <= time && episode.edge(step, agent, index))
-      .flatMap((node) => binEdge(slot, node, PAINT.discovered, 0.15)));
+      .flatMap((node) => binEdge(binAt(episode, slot, time), node, PAINT.discovered, 0.15)));
   }
   const shown = Object.keys(episode.attention).filter((name) => !choice.stage || choice.stage === name);
   return shown.flatMap((name) => weightsAt(episode.attention[name], step, choice.layer, choice.head))
     .filter(({ receiver, source }) => source !== receiver)
     .flatMap(({ receiver, source, weight }) => source < episode.agents
       ? agentEdge(agents[source], agents[receiver], theme.neighbours, weight, out)
-      : binEdge(episode.slots[source - episode.agents], agents[receiver], PAINT.attention, weight));
+      : binEdge(binAt(episode, episode.slots[source - episode.agents], time), agents[receiver], PAINT.attention, weight));
 }
 
 // From surface to surface.

@@ -48,6 +48,18 @@ async function readEpisode() {
   };
 }
 
+// How far a cylinder that moves is from where it began, at a time.
+function shiftAt(episode, cylinder, time) {
+  const { cylinders, shift, steps } = episode;
+  if (!shift) return new Vector3();
+  const step = Math.min(Math.floor(time), steps);
+  const at = (k) => vec(shift, 3 * (k * cylinders.length + cylinder));
+  return at(step).lerp(at(Math.min(step + 1, steps)), time - step);
+}
+
+// A discovered bin where its cylinder is at a time.
+const binAt = (episode, slot, time) => ({ ...slot, centre: shiftAt(episode, slot.cylinder, time).add(slot.centre) });
+
 // Weights of one stage at a step, averaged over the layers and heads that are not chosen (null: all of them).
 function weightsAt(stage, step, layer, head) {
   const row = Math.min(Math.floor(step / stage.every), stage.begin.length - 2);

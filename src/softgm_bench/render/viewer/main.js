@@ -42,7 +42,7 @@ async function main() {
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
     context.clearRect(0, 0, view.width, view.height);
     if (scene) scene.draw(time, rod, [...path, ...edges], theme, show, ratio);
-    else drawFlat(context, episode, rod, view);
+    else drawFlat(context, episode, rod, time, view);
     if (show.labels) drawLabels(context, episode, rod, view);
     readOuts(episode, state);
     for (const plot of plots) plot.draw();
@@ -168,14 +168,17 @@ function speak(episode, state) {
 }
 
 // Without WebGL: thick strokes with round ends, one over the other.
-function drawFlat(context, episode, rod, view) {
+function drawFlat(context, episode, rod, time, view) {
   const stroke = (start, end, radius, colour) => {
     const [a, b] = [view.project(start), view.project(along(end, UP, 1e-4))]; // a stroke without length is none
     if (Math.min(a.metres, b.metres) <= 0) return;
     Object.assign(context, { lineCap: "round", lineWidth: (2 * radius) / a.metres, strokeStyle: colour });
     context.stroke(new Path2D(`M${a.x} ${a.y}L${b.x} ${b.y}`));
   };
-  for (const c of episode.cylinders) stroke(c.start, along(c.start, c.axis, c.length), c.radius, css(PAINT.column, 0.5));
+  episode.cylinders.forEach((cylinder, c) => {
+    const start = shiftAt(episode, c, time).add(cylinder.start);
+    stroke(start, along(start, cylinder.axis, cylinder.length), cylinder.radius, css(PAINT.column, 0.5));
+  });
   rod.slice(1).forEach((node, i) => stroke(rod[i].centre, node.centre, node.radius, css(gradient(PAINT.arm, i / rod.length))));
   stroke(episode.target, episode.target, episode.successRadius, css(PAINT.target, 0.6));
 }

@@ -120,7 +120,7 @@ class ArmScene {
   }
 
   obstacles() {
-    const { cylinders, slots } = this.episode;
+    const { cylinders, shift, slots } = this.episode;
     const material = { roughness: 0.55 };
     const bins = new THREE.CylinderGeometry(1, 1, 1, 40);
     this.bins = this.instances(bins, new THREE.MeshStandardMaterial(material), slots.length, ORDER.clear);
@@ -128,10 +128,20 @@ class ArmScene {
     this.depths[0].instanceMatrix = this.bins.instanceMatrix;
     this.posts = [];
     if (!cylinders.length) return;
-    const capsules = THREE.mergeGeometries(cylinders.map(({ start, axis, length, radius }) =>
-      new THREE.CapsuleGeometry(radius, length, 10, 40).applyMatrix4(placed(start, axis, length, 1, 1))));
-    this.posts = [this.add(capsules, new THREE.MeshStandardMaterial({ ...material, color: PAINT.column }), ORDER.clear, true)];
-    this.depths.push(this.add(capsules, new THREE.MeshBasicMaterial({ colorWrite: false, transparent: true }), ORDER.depth));
+    const capsules = cylinders.map(({ start, axis, length, radius }) =>
+      new THREE.CapsuleGeometry(radius, length, 10, 40).applyMatrix4(placed(start, axis, length, 1, 1)));
+    const shapes = shift ? capsules : [THREE.mergeGeometries(capsules)]; // what moves, moves by itself
+    const solid = new THREE.MeshStandardMaterial({ ...material, color: PAINT.column });
+    const depth = new THREE.MeshBasicMaterial({ colorWrite: false, transparent: true });
+    this.posts = shapes.map((shape) => this.add(shape, solid, ORDER.clear, true));
+    this.depths.push(...shapes.map((shape) => this.add(shape, depth, ORDER.depth)));
+  }
+
+  setPosts(time) {
+    if (!this.episode.shift) return;
+    this.posts.forEach((post, c) => {
+      for (const mesh of [post, this.depths[1 + c]]) mesh.position.copy(shiftAt(this.episode, c, time));
+    });
   }
 
   target() {
@@ -149,6 +159,7 @@ class ArmScene {
     this.setTheme(theme);
     this.setClear(show.clear);
     this.arm.set(rod, reached);
+    this.setPosts(time);
     this.setBins(time);
     this.setTarget(reached, show.clear);
     this.setArrows(time, rod, theme, show.actions);
@@ -193,7 +204,8 @@ class ArmScene {
       const flash = Math.exp(-(time - slot.step) / 2);
       const half = 0.93 * slot.half;
       const radius = slot.radius * (1.03 + 0.14 * flash);
-      this.bins.setMatrixAt(shown, placed(along(slot.centre, slot.axis, -half), slot.axis, 2 * half, radius));
+      const { centre } = binAt(this.episode, slot, time);
+      this.bins.setMatrixAt(shown, placed(along(centre, slot.axis, -half), slot.axis, 2 * half, radius));
       const colour = mixed(PAINT.column, PAINT.discovered, sensed ? 1 : 0.72).lerp(PAINT.new, flash);
       this.bins.setColorAt(shown++, colour.multiplyScalar(1 + 0.2 * flash));
     });
