@@ -40,6 +40,7 @@ def test_it_writes_what_it_finds_and_goes_on_from_it(tmp_path, monkeypatch, caps
         (["task=basic", "minutes=-1"], "minutes=-1"),
         (["task=basic", "threads=1000"], "threads=1000"),
         (["task=basic", "nothing=1"], "nothing"),
+        (["task=wall_sliding"], "task=wall_sliding: its obstacles move"),
         (["task=vmas_balance", "model=vector_mlp"], "model"),
     ],
 )

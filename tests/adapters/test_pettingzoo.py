@@ -11,6 +11,7 @@ from gymnasium.utils.env_checker import data_equivalence
 from pettingzoo.test import parallel_api_test, parallel_seed_test
 from torchrl.envs import PettingZooWrapper, check_env_specs
 
+from every_task import MOVING
 from softgm_bench.adapters.pettingzoo import parallel_env
 from softgm_bench.envs import entries, make_env
 from softgm_bench.errors import UserError
@@ -73,6 +74,11 @@ def test_pettingzoo_s_own_test_passes_over_hundreds_of_cycles(observation, recwa
 
 def test_pettingzoo_s_own_test_passes_on_the_wall():
     parallel_api_test(parallel_env("wall", horizon=20), num_cycles=60)
+
+
+@pytest.mark.parametrize("task", MOVING)
+def test_pettingzoo_s_own_test_passes_where_obstacles_move(task):
+    parallel_api_test(parallel_env(task, horizon=20, overrides=[QUICK]), num_cycles=60)
 
 
 def test_pettingzoo_s_own_test_of_seeds_passes():

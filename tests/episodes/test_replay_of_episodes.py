@@ -12,6 +12,7 @@ from softgm_bench.episodes.replay import compare, replay
 from softgm_bench.errors import UserError
 
 pytestmark = pytest.mark.usefixtures("one_thread")
+SLIDING = ("task=wall_sliding", "task.wall_x=0.2", "task.slide_speed=0.2")  # the wall that the arm leans on soon
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
@@ -27,6 +28,25 @@ def test_a_replay_from_the_file_has_the_recordings_bits(task, dtype, tmp_path):
     result = compare(one, again)
     assert result["identical"]
     assert result["replayed"] == result["recorded"]
+
+
+@pytest.mark.parametrize("task", [SLIDING, ("task=swinging_posts",)], ids=lambda overrides: overrides[0])
+def test_obstacles_move_in_a_replay_as_they_did(task, tmp_path):
+    one = recorded(*task, horizon=15)
+    trajectory.save(one, tmp_path / "episode.npz")
+    loaded = trajectory.load(tmp_path / "episode.npz")
+    path = loaded.cylinders[trajectory.PATH]
+    assert path.shape == (16, len(loaded.cylinders["length"]), 3)
+    assert (np.abs(np.diff(path, axis=0)).max(axis=(1, 2)) > 0.0).all()
+    assert np.array_equal(loaded.starts(0), loaded.cylinders["start"])
+    assert np.allclose(loaded.starts(3.25), 0.75 * path[3] + 0.25 * path[4], rtol=0.0, atol=1e-15)
+    assert np.array_equal(loaded.starts(15), path[15])
+    assert one.contact.any() == (task is SLIDING)
+    assert compare(one, replay(loaded, "numba"))["identical"]
+    in_pyelastica = replay(loaded, "pyelastica")
+    assert np.abs(in_pyelastica.position - one.position).max() < 1e-10
+    still = dataclasses.replace(one, cylinders={k: v for k, v in one.cylinders.items() if k != trajectory.PATH})
+    assert compare(one, replay(still, "numba"))["identical"] == (task is not SLIDING)
 
 
 def test_the_wall_is_touched_in_what_is_replayed():
