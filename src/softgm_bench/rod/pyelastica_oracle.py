@@ -78,17 +78,17 @@ class _Given(ea.NoForces):
 
 
 class Carriage:
-    """A cylinder's centre was at ``centre`` (3,) in m at ``time`` in s and moves at ``velocity`` (3,) in m/s."""
+    """A cylinder's centre is at ``centre`` (3,) in m at time 0 and moves at ``velocity`` (3,) in m/s."""
 
     def __init__(self, post: Post) -> None:
         """Begin at rest."""
-        self.post, self.time = post, np.float64(0.0)
-        self.put(np.array(post.start), np.zeros(3), self.time)
+        self.post = post
+        self.put(np.array(post.start), np.zeros(3))
 
-    def put(self, start: Array, velocity: Array, time: np.float64) -> None:
-        """Be with the post's start at ``start`` at this time, and go on at this velocity."""
+    def put(self, start: Array, velocity: Array) -> None:
+        """Be with the post's start at ``start``, and go on at this velocity."""
         self.centre = start + np.array(self.post.axis) * self.post.length / 2
-        self.velocity, self.time = velocity, time
+        self.velocity = velocity
 
 
 class _Carried(ea.ConstraintBase):
@@ -99,8 +99,7 @@ class _Carried(ea.ConstraintBase):
         self.carriage, self.director = carriage, self.system.director_collection.copy()
 
     def constrain_values(self, system, time):
-        c = self.carriage
-        system.position_collection[..., 0] = c.centre + (time - c.time) * c.velocity
+        system.position_collection[..., 0] = self.carriage.centre + time * self.carriage.velocity
         system.director_collection[...] = self.director
         self.constrain_rates(system, time)  # contact, which comes next, sees the velocity of this step
 
@@ -257,8 +256,9 @@ class Arm:
 
     def carry(self, start: Sequence[Array | tuple[float, ...]], velocity: Array) -> None:
         """Put the carried posts' starts somewhere, m, from where they move on, m/s, ``(posts, 3)`` each."""
+        self._time = np.float64(0.0)  # so that no bit depends on what this simulator moved before
         for carriage, at, rate in zip(self._carriages, start, velocity, strict=True):
-            carriage.put(np.array(at), np.array(rate), self._time)
+            carriage.put(np.array(at), np.array(rate))
 
     def control_step(self, couple: Array, force: Array | None = None, substeps: int | None = None) -> float:
         """Move by a control step under a couple ``(3, n_elements)`` in N m and a force ``(3, n_nodes)`` in N.
