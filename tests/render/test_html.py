@@ -357,6 +357,36 @@ def test_the_page_reads_what_was_recorded(tmp_path, episode):
         assert edge["weight"] == pytest.approx(weight, abs=0.51 / 255)
 
 
+def test_a_post_that_moves_and_its_bins_are_read_where_they_are(tmp_path, episode):
+    """Bins were found at steps 0, 4 and 8, when the post was somewhere else each time."""
+    shift = 0.2 * np.sin(np.arange(episode.steps + 1) / 9.0)[:, None, None] * [0.0, 1.0, 0.0]
+    seen = dict(episode.observation)
+    seen["slots/descriptor"] = seen["slots/descriptor"].copy()
+    seen["slots/descriptor"][..., :3] += shift
+    path = episode.cylinders["start"] + shift
+    moving = replace(episode, cylinders=episode.cylinders | {"path": path}, observation=seen)
+    parts = "".join((VIEWER / name).read_text() for name in ("three/three.min.js", "episode.js"))
+    harness = """
+    const page = require("fs").readFileSync(process.argv[2], "utf8");
+    globalThis.document = { getElementById: () => ({ textContent: page }) };
+    readEpisode().then((e) => console.log(JSON.stringify({
+      still: [...shiftAt({ ...e, shift: undefined }, 0, 7)],
+      shift: [0, 7, 7.25, e.steps].map((time) => [...shiftAt(e, 0, time)]),
+      bins: [0, 7, e.steps].map((time) => e.slots.map((slot) => [...binAt(e, slot, time).centre])) })));
+    """
+    (tmp_path / "read.js").write_text(parts + harness)
+    (tmp_path / "episode.json").write_text(json.dumps(payload(moving)))
+    found = json.loads(run_node([str(tmp_path / "read.js"), str(tmp_path / "episode.json")]))
+    away = shift[:, 0]
+    expected = [away[0], away[7], 0.75 * away[7] + 0.25 * away[8], away[-1]]
+    np.testing.assert_allclose(found["shift"], expected, atol=1e-5)
+    assert found["still"] == [0.0, 0.0, 0.0]
+    centres = episode.observation["slots/descriptor"][-1, :3, :3]
+    for bins, step in zip(found["bins"], (0, 7, -1), strict=True):
+        np.testing.assert_allclose(bins, centres + away[step], atol=1e-5)
+    assert "shift" not in payload(episode)["arrays"]
+
+
 # the page in a browser
 
 

@@ -1,3 +1,5 @@
+import dataclasses
+
 import numpy as np
 import pytest
 from arms import POST_RADIUS, STEPS, bending_arm
@@ -29,6 +31,25 @@ def test_posts_are_opaque_and_walls_are_seen_through():
     many = {name: np.repeat(values, 6, axis=0) for name, values in episode.cylinders.items()}
     object.__setattr__(episode, "cylinders", many)
     assert colour_on_post(Stage(episode), 3.0, 0.5)[3] == pytest.approx(SEEN_THROUGH)
+
+
+def test_posts_that_move_are_drawn_where_they_are_and_their_bins_stay_on_them():
+    still = bending_arm()
+    shift = np.linspace(0.0, 0.3, STEPS + 1)[:, None, None] * [0.0, 1.0, 0.0]
+    seen = dict(still.observation)
+    seen["slots/descriptor"] = seen["slots/descriptor"].copy()
+    seen["slots/descriptor"][..., :3] += shift
+    cylinders = still.cylinders | {"path": still.cylinders["start"] + shift}
+    moving = dataclasses.replace(still, cylinders=cylinders, observation=seen)
+    stage = Stage(moving)
+    for step, away in ((0.0, 0.0), (2.5, 0.125), (float(STEPS), 0.3)):
+        drawing = stage.draw(step)
+        feet = drawing.cone[drawing.owner == CYLINDER, :3]
+        np.testing.assert_allclose(feet, still.cylinders["start"] + [0.0, away, 0.0], atol=1e-12)
+    for found, expected in zip(stage.first_seen, Stage(still).first_seen, strict=True):
+        np.testing.assert_array_equal(found, expected)
+    assert stage.extent()[:, 1].max() == pytest.approx(0.2 + 0.3 + POST_RADIUS)
+    assert Stage(still).extent()[:, 1].max() == pytest.approx(0.2 + POST_RADIUS)
 
 
 def test_the_arm_that_is_drawn_is_the_simulated_one():
