@@ -353,7 +353,7 @@ def numba_forces(position: Tensor, velocity: Tensor, cylinders: Cylinders, param
     p = parameters
     per_element = np.array([p.contact_stiffness, p.contact_damping, 0.0, p.velocity_damping_coefficient])
     contact = (per_element / p.contact_length + [0.0, 0.0, p.friction_coefficient, 0.0]).astype(real)
-    touch = make_touch(layout, real, "exact")
+    touch = make_touch(layout, real, "exact", False)
     for c in range(cylinders.mask.shape[1]):
         edge = cylinders.axis[0, c] * cylinders.length[0, c]
         row = np.array([*cylinders.start[0, c], *edge, cylinders.radius[0, c], 0.0], dtype=real)

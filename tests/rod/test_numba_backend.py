@@ -192,7 +192,7 @@ def test_float32_kernel_computes_nothing_in_float64():
     for name, signature in signatures.items():
         assert double_arithmetic(getattr(kernel, name), signature) == [], name
     for model in CONTACT_MODELS:
-        contact = make_contact(layout, np.float32, make_touch(layout, np.float32, model))
+        contact = make_contact(layout, np.float32, make_touch(layout, np.float32, model, False))
         assert double_arithmetic(contact.add_contact, (row, table, real, real, row, real)) == []
 
 
