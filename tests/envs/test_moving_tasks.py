@@ -102,7 +102,7 @@ def test_a_wall_that_slides_at_speed_zero_is_one_that_stands_still_bit_for_bit(s
         for k in range(8):
             action = torch.full((2, 6, 2), 0.5 - 0.1 * k)
             td = env.step(td.set(entries.ACTION, action))["next"]
-            told.append(td)
+            told.append(td.clone())  # the next step writes into it
         frames[task] = torch.stack(told).exclude(entries.PRIVILEGED)
         assert td[entries.CONTACT_NODES].any()
         assert td[entries.SLOT_ACTIVE].any()

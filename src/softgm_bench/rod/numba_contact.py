@@ -120,12 +120,11 @@ class Motion(NamedTuple):
     """These are compiled functions on one rod's cylinders, which do nothing where cylinders stand still.
 
     ``speed`` gives the fastest cylinder's speed, ``carry`` brings the cylinders to where they are in the middle of a
-    substep, ``relative`` sees a component of a velocity from a cylinder.
+    substep.
     """
 
     speed: Callable[..., Any]
     carry: Callable[..., Any]
-    relative: Callable[..., Any]
 
 
 @lru_cache
@@ -138,9 +137,6 @@ def make_motion(real: type, moving: bool) -> Motion:
 
     def stay(cylinders, substep, dt):
         pass
-
-    def own(velocity, cylinder, i):
-        return velocity
 
     def speed(cylinders):
         fastest = zero
@@ -155,12 +151,9 @@ def make_motion(real: type, moving: bool) -> Motion:
             for i in range(3):
                 cylinders[c, START + i] = cylinders[c, ORIGIN + i] + time * cylinders[c, VELOCITY + i]
 
-    def relative(velocity, cylinder, i):
-        return velocity - cylinder[VELOCITY + i]
-
     if moving:
-        return Motion(jit(speed), jit(carry), jit(relative, inline=True))
-    return Motion(jit(no_speed, inline=True), jit(stay, inline=True), jit(own, inline=True))
+        return Motion(jit(speed), jit(carry))
+    return Motion(jit(no_speed, inline=True), jit(stay, inline=True))
 
 
 @lru_cache
@@ -183,18 +176,13 @@ def make_touch(layout: Layout, real: type, contact_model: str, moving: bool) -> 
         )
         if not touching:
             return
-        fx, fy, fz, gx, gy, gz = forces(
-            found,
-            k,
-            relative(s[p.vx + k], cylinder, 0),
-            relative(s[p.vy + k], cylinder, 1),
-            relative(s[p.vz + k], cylinder, 2),
-            relative(s[p.vx + k + 1], cylinder, 0),
-            relative(s[p.vy + k + 1], cylinder, 1),
-            relative(s[p.vz + k + 1], cylinder, 2),
-            s[p.rest + k],
-            contact,
-        )
+        vx, vy, vz = s[p.vx + k], s[p.vy + k], s[p.vz + k]
+        wx, wy, wz = s[p.vx + k + 1], s[p.vy + k + 1], s[p.vz + k + 1]
+        if moving:  # known when this is compiled
+            vx, wx = vx - cylinder[VELOCITY], wx - cylinder[VELOCITY]
+            vy, wy = vy - cylinder[VELOCITY + 1], wy - cylinder[VELOCITY + 1]
+            vz, wz = vz - cylinder[VELOCITY + 2], wz - cylinder[VELOCITY + 2]
+        fx, fy, fz, gx, gy, gz = forces(found, k, vx, vy, vz, wx, wy, wz, s[p.rest + k], contact)
         s[p.fx + k] -= fx
         s[p.fy + k] -= fy
         s[p.fz + k] -= fz
@@ -202,8 +190,7 @@ def make_touch(layout: Layout, real: type, contact_model: str, moving: bool) -> 
         s[p.fy + k + 1] -= gy
         s[p.fz + k + 1] -= gz
 
-    pair = make_pair(contact_model, layout.n, real, jit)._asdict()
-    return jit(touch, **pair, relative=make_motion(real, moving).relative)
+    return jit(touch, **make_pair(contact_model, layout.n, real, jit)._asdict())
 
 
 def told_apart(layout: Layout, contact_model: str, moving: bool) -> Layout:
