@@ -53,10 +53,12 @@ def test_only_the_tuned_recipe_has_what_walls_need_and_only_on_walls():
     for task in TASKS:
         for recipe in ("paper", "tuned"):
             config = compose([f"task={task}", f"recipe={recipe}"])
-            expected = recipe == "tuned" and task.startswith("wall")
-            assert config.task.curriculum.enabled is config.algo.critic.asymmetric is expected
+            assert config.task.curriculum.enabled is (recipe == "tuned" and task.startswith("wall"))
+            assert config.task.hidden_scene is (task.startswith("wall") or task == "swinging_posts")
+            hidden = recipe == "tuned" and config.task.hidden_scene
+            assert config.algo.critic.asymmetric is hidden
             assert (config.experiment.num_envs, config.algo.minibatch_size, config.algo.gamma) == (
-                ((128, 800, 0.98) if expected else (512, 1280, 0.95)) if recipe == "tuned" else (128, 1600, 0.99)
+                ((128, 800, 0.98) if hidden else (512, 1280, 0.95)) if recipe == "tuned" else (128, 1600, 0.99)
             )
 
 
