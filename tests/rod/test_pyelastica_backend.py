@@ -174,7 +174,7 @@ def test_what_pyelastica_cannot_do_is_refused_in_one_line(monkeypatch: pytest.Mo
 def test_the_backend_is_the_oracle_in_every_case_of_the_parity_table():
     for name, case in CASES.items():
         force = None if case.force is None else lambda step, case=case: case.force
-        theirs = simulate(case.parameters, case.couple(), case.steps, case.posts, force, velocity=case.velocity())
+        theirs = simulate(case.parameters, case.couple(), case.steps, case.posts, force, post_velocity=case.velocity())
         ours = our_trajectories("pyelastica", {name: case})[name]
         for quantity in QUANTITIES:
             np.testing.assert_array_equal(ours[quantity], getattr(theirs, quantity), err_msg=f"{name}: {quantity}")

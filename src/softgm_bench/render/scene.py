@@ -247,7 +247,7 @@ def _first_seen(trajectory: Trajectory, bin_length: float) -> list[Array]:
     active = trajectory.observation.get("slots/active", np.zeros((1, 0), dtype=bool))
     for slot in np.flatnonzero(active.any(axis=0)) if seen else ():
         first = int(active[:, slot].argmax())
-        c, along = cylinder_of(trajectory, slot, first)
+        c, along = cylinder_of(trajectory, int(slot), first)
         index = min(int(along / bin_length), len(seen[c]) - 1)
         seen[c][index] = min(seen[c][index], first)
     return seen

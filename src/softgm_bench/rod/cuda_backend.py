@@ -85,8 +85,8 @@ class CudaBackend:
             if cylinders is not None and contact is not None:
                 geometry = (cylinders.start, cylinders.axis, cylinders.length, cylinders.radius)
                 velocity = nothing if cylinder_velocity is None else cylinder_velocity
-                *geometry, velocity = _inputs(dtype, *geometry, velocity)
-                obstacles = [*geometry, cylinders.mask.contiguous(), velocity]
+                *shapes, velocity = _inputs(dtype, *geometry, velocity)
+                obstacles = [*shapes, cylinders.mask.contiguous(), velocity]
             columns = scratch_columns(self.parameters.n_elements, REAL[dtype])
             scratch = torch.empty((len(couple), ROWS, columns), dtype=dtype, device=device) if columns else nothing
             flags = never[0] if active is None else active.bool().contiguous()

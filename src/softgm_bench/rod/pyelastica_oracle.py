@@ -223,7 +223,8 @@ def build(
         if any(parameters.gravity):
             simulator.add_forcing_to(rod).using(ea.GravityForces, acc_gravity=np.array(parameters.gravity))
         simulator.add_forcing_to(rod).using(_Given, loads=loads)
-    for post, carriage in zip(posts, carriages or [None] * len(posts), strict=True):
+    moved_by: Sequence[Carriage | None] = carriages or [None] * len(posts)
+    for post, carriage in zip(posts, moved_by, strict=True):
         _add_cylinder(simulator, arms, post, carriage, parameters)
     return simulator, arms[0]
 
@@ -280,20 +281,20 @@ def simulate(
     posts: Sequence[Post] = (),
     force: Callable[[int], Array] | None = None,
     pruning: bool = False,
-    velocity: Callable[[int], Array] | None = None,
+    post_velocity: Callable[[int], Array] | None = None,
 ) -> History:
     """Run ``steps`` control steps; ``couple(step)`` is ``(3, n_elements)`` and ``force(step)`` ``(3, n_nodes)``.
 
-    ``velocity(step)`` is the posts', m/s, ``(posts, 3)``; without it they stand still.
+    ``post_velocity(step)`` is the posts', m/s, ``(posts, 3)``; without it they stand still.
     PyElastica skips cylinders by bounding boxes, which miss contacts: only with ``pruning`` it does so here.
     """
-    arm, forces, states = Arm(parameters, posts, carried=velocity is not None), [], []
+    arm, forces, states = Arm(parameters, posts, carried=post_velocity is not None), [], []
     start = np.array([post.start for post in posts])
     with watched_pruning(pruning) as watched:
         for step in range(steps):
-            if velocity is not None:
-                arm.carry(list(start), velocity(step))
-                start = start + parameters.control_dt * velocity(step)
+            if post_velocity is not None:
+                arm.carry(list(start), post_velocity(step))
+                start = start + parameters.control_dt * post_velocity(step)
             forces.append(arm.control_step(couple(step), None if force is None else force(step)))
             states.append([array.copy() for array in arm.state])
     position, director, velocity, omega = (np.stack(series) for series in zip(*states, strict=True))

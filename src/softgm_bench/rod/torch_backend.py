@@ -59,6 +59,10 @@ class Obstacles(NamedTuple):
     cylinders: Cylinders
     velocity: Tensor | None
 
+    def of(self, rows: Tensor) -> "Obstacles":
+        """Select environments."""
+        return Obstacles(self.cylinders[rows], None if self.velocity is None else self.velocity[rows])
+
     def at(self, time: float) -> Cylinders:
         """Give the cylinders ``time`` s into the step."""
         if self.velocity is None:
@@ -134,7 +138,7 @@ class TorchBackend:
                 Motion(*(old[chosen] for old in motion)),
                 couple[chosen],
                 None if force is None else force[chosen],
-                None if obstacles is None else Obstacles(*(x if x is None else x[chosen] for x in obstacles)),
+                None if obstacles is None else obstacles.of(chosen),
                 substeps,
             )
             moved = Motion(*(old.index_put((chosen,), new) for old, new in zip(motion, moved, strict=True)))
