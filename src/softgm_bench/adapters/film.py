@@ -82,7 +82,7 @@ class Film:
         exists = _first_row(cylinders.mask)
         states = {name: np.stack(values) for name, values in self._states.items()}
         path = states.pop("starts")[:, exists].astype(float)
-        shapes = {name: _first_row(getattr(cylinders, name))[exists].astype(float) for name in CYLINDER_FIELDS}
+        bodies = {name: _first_row(getattr(cylinders, name))[exists].astype(float) for name in CYLINDER_FIELDS}
         steps = len(self._steps["reward"])
         shapes = {"action": (steps, arm.sizes.n_agents, arm.sizes.action), "tip_force": (steps, 3), "reward": (steps,)}
         return Trajectory(
@@ -91,7 +91,7 @@ class Film:
             **{name: np.array(values).reshape(shapes[name]) for name, values in self._steps.items()},
             target=_first_row(arm.scene.target).astype(np.float64),
             reward_terms={},
-            cylinders=shapes | ({"start": path[0], PATH: path} if arm.task.moves else {}),
+            cylinders=bodies | ({"start": path[0], PATH: path} if arm.task.moves else {}),
             attention={},
             success=bool(self._td[entries.SUCCESS]),
             diverged=bool(self._td[entries.DIVERGED]),
