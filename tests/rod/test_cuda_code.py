@@ -65,15 +65,6 @@ def test_float32_code_with_cylinders_that_move_holds_no_float64_instruction(cont
     assert ".f64" not in ptx(60, np.float32, contact, moving=True)
 
 
-@pytest.mark.parametrize("contact", ["pyelastica", "exact"])
-@pytest.mark.parametrize("real", PRECISIONS)
-def test_the_arm_stays_in_registers_among_cylinders_that_move(real: type, contact: str, tmp_path: Path):
-    used = assembled(60, real, contact, tmp_path, moving=True)
-    print(used)
-    assert used["registers"] <= {np.float32: 96, np.float64: 168}[real]
-    assert used["spills"] <= {np.float32: 0, np.float64: 120}[real]
-
-
 def test_float64_code_holds_float64_instructions():
     assert ".f64" in ptx(60, np.float64, None)
 
