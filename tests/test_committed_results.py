@@ -11,6 +11,7 @@ import pytest
 import torch
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from softgm_bench.analysis.statistics import mcnemar
 from softgm_bench.envs import entries, make_env
 from softgm_bench.episodes import policy
 from softgm_bench.rod.actuation import Actuation
@@ -78,21 +79,50 @@ def test_a_kept_policy_belongs_to_a_committed_run(path, results):
     assert trained.frames in [run.final.frames for run in results.runs(task) if run.final.label == trained.config.label]
 
 
-def test_the_kept_trial_is_the_policy_of_its_evaluations_and_the_page_says_what_they_hold(results):
+@pytest.mark.parametrize(
+    ("trial", "frames", "name"),
+    [
+        ("envs-128_promote-0.5_entropy-0.003", 2_400_000, "gamma 0.95"),
+        ("tuned", 3_001_600, "gamma 0.98"),
+    ],
+)
+def test_a_kept_trial_is_the_policy_of_its_evaluations_and_the_page_says_what_they_hold(results, trial, frames, name):
     page = results.PAGE.read_text()
-    folder = ROOT / "experiments/trials/wall/envs-128_promote-0.5_entropy-0.003/policy-2400000"
-    frames = policy.load(folder.with_suffix(".pt")).frames
+    folder = ROOT / f"experiments/trials/wall/{trial}/policy-{frames // 100_000}00000"
+    assert policy.load(folder.with_suffix(".pt")).frames == frames
     rows = {"none": "what agents have sensed", "blind": "no obstacle", "swap_obstacles": "another scene's obstacles"}
-    summaries = [json.loads((folder / name / "summary.json").read_text()) for name in (*rows, "none_1000")]
+    summaries = [json.loads((folder / intervention / "summary.json").read_text()) for intervention in rows]
     assert len({summary["policy"] for summary in summaries}) == 1
-    assert {summary["frames"] for summary in summaries} == {frames} == {2_400_000}
-    for (name, shown), summary in zip(rows.items(), summaries, strict=False):
-        assert summary["intervention"] == name
+    for (intervention, shown), summary in zip(rows.items(), summaries, strict=True):
+        assert (summary["intervention"], summary["frames"]) == (intervention, frames)
         metrics = summary["metrics"]
         cells = [f"{metrics[key]['mean']:.3f}" for key in ("success_rate", "success_certified")]
-        assert f"| the kept one, {shown} | {' | '.join(cells)} | {metrics['motionless_failures']} |" in page
-    success = summaries[-1]["metrics"]["success_rate"]
-    assert f"{success['mean']:.3f} [{success['low']:.3f}, {success['high']:.3f}] of 1000 scenes" in page
+        assert f"| {name}, {shown} | {' | '.join(cells)} | {metrics['motionless_failures']} |" in page
+
+
+def test_the_published_policies_that_a_kept_trial_is_compared_with_played_the_same_scenes(results):
+    page = results.PAGE.read_text()
+    trial = results.episodes_in(results.TRIAL)["none"]["success"]
+    rows = {
+        "softgm": "the published SoftGM, what agents have sensed",
+        "softgm_oracle": "the published oracle, and where the opening is",
+    }
+    for label, shown in rows.items():
+        metrics = json.loads((results.FAILURES / "wall" / label / "summary.json").read_text())["metrics"]
+        split = mcnemar(trial, results.episodes_in(results.FAILURES)[f"wall/{label}"]["success"])
+        cells = [f"{metrics[key]['mean']:.3f}" for key in ("success_rate", "success_certified")]
+        assert (
+            f"| {shown} | {' | '.join(cells)} | {metrics['motionless_failures']} | {split.lost}, {split.won} |" in page
+        )
+
+
+def test_what_the_walls_recipe_reached_is_its_runs_own_final_evaluation(results):
+    folder = ROOT / "experiments/trials/wall/tuned"
+    final = json.loads((folder / "summary.json").read_text())["final_evaluation"]
+    success = final["success_rate"]
+    told = f"{success['mean']:.3f} [{success['low']:.3f}, {success['high']:.3f}] of {final['episodes']} scenes, "
+    told += f"{final['success_by_step']['400']:.3f} within 400 steps; {final['motionless_failures']} arms stood still"
+    assert told in " ".join(results.PAGE.read_text().split())
 
 
 def folders_elsewhere(results):

@@ -36,7 +36,7 @@ def test_a_part_that_only_one_has_differs_in_each_of_its_keys():
 
 def test_a_run_from_before_there_were_named_recipes_is_the_same_run():
     """What a recipe or an experiment stands for is compared, not what it is called."""
-    plainly = ["algo.actor.embedding_norm=false", "algo.critic.embedding_norm=false"]  # there was no other way
+    plainly = ["algo.actor.embedding_norm=false", "algo.critic.embedding_norm=false"]  # an old run's never were
     for recipe in ("tuned", "paper"):
         today = plain(compose(["task=wall", f"recipe={recipe}", "experiment=quick", *plainly]))
         before = OmegaConf.create(today)
