@@ -1,8 +1,8 @@
 """Tables and learning curves of all committed runs: ``python experiments/results.py``.
 
 Reads ``experiments/trained/<task>/<algorithm>/seed<seed>/``, ``experiments/sections/<task>/<algorithm>/<setting>/``,
-``experiments/failures/wall/<algorithm>/`` and the kept trial's evaluations. Rewrites ``docs/learning_curves.png`` and the
-tables in ``docs/results.md``, each between ``<!-- table -->`` and ``<!-- end -->``.
+``experiments/failures/wall/<algorithm>/`` and the kept trial's evaluations. Rewrites ``docs/learning_curves.png`` and
+the tables in ``docs/results.md``, each between ``<!-- table -->`` and ``<!-- end -->``.
 """
 
 import math
