@@ -37,7 +37,10 @@ def run(folder, *arguments):
 # Each process takes seconds to start, so mistakes that are told apart here are those that take different ways out:
 # Hydra's composition, the dataclasses, the semantic checks, the file system. The rest is in tests/config.
 MISTAKES = {
-    "unknown task": (["task=wal"], "task=wal: no such task; choose one of basic, structured, vmas_balance"),
+    "unknown task": (
+        ["task=wal"],
+        "task=wal: no such task; choose one of basic, structured, swinging_posts, ",
+    ),
     "misspelt key": (["experiment.num_env=4"], "experiment.num_env: no such key; did you mean experiment.num_envs?"),
     "wrong type": (["experiment.num_envs=many"], "experiment.num_envs: Value 'many' of type 'str' could not be"),
     "negative seed": (["seed=-1"], "seed=-1: a seed is a whole number from 0"),

@@ -119,7 +119,7 @@ def test_a_grid_shows_its_own_cells_and_what_is_missing(tmp_path):
 
 
 def test_an_unknown_grid_is_refused_with_those_there_are(tmp_path):
-    with pytest.raises(UserError, match=r"grid=table3: no such grid; choose one of ablation, .*, ladder, table1, "):
+    with pytest.raises(UserError, match=r"grid=table3: no such grid; choose one of ablation, .*, ladder, rivals, "):
         status._cells(tmp_path, "table3")
 
 

@@ -9,7 +9,7 @@ from round_trips import RoundTrips
 from softgm_bench.envs import SoftArmEnv, entries, make_env
 from softgm_bench.rod.parameters import RodParameters
 
-TASKS = ("basic", "structured", "wall")
+TASKS = ("basic", "structured", "wall", "wall_sliding", "swinging_posts")
 
 
 class Standing:
@@ -18,7 +18,7 @@ class Standing:
     def __init__(self, parameters: RodParameters) -> None:
         self.parameters = parameters
 
-    def control_step(self, state, couple, force=None, cylinders=None, active=None, substeps=None):
+    def control_step(self, state, couple, **others):
         return state.clone()
 
 
