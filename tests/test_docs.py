@@ -38,13 +38,15 @@ def test_the_committed_run_has_the_success_that_the_readme_states():
 def test_the_results_of_the_readme_are_those_of_the_committed_runs():
     readme = (ROOT / "README.md").read_text().partition("## Results")[2].partition("\n## ")[0]
     rows = re.findall(
-        r"^\| (?:`(\w+)`[^|]*)?\| (\w+)[^|]* \| ([0-9.]+) \| \[([0-9.]+), ([0-9.]+)\] \|$", readme, re.MULTILINE
+        r"^\| (?:`(\w+)`[^|]*)?\| (\w+)([^|]*) \| ([0-9.]+) \| \[([0-9.]+), ([0-9.]+)\] \|$", readme, re.MULTILINE
     )
-    assert len(rows) == 10
+    assert len(rows) == 11
     task = ""
-    for named, algorithm, *stated in rows:
+    for named, algorithm, told, *stated in rows:
         task = named or task
-        summary = ROOT / "experiments/trained" / task / algorithm.lower() / "seed0/summary.json"
+        of_today = task == "wall" and "as the recipe was" not in told
+        run = "trials/wall/tuned" if of_today else f"trained/{task}/{algorithm.lower()}/seed0"
+        summary = ROOT / "experiments" / run / "summary.json"
         success = json.loads(summary.read_text())["final_evaluation"]["success_rate"]
         assert [f"{success[key]:.3f}" for key in ("mean", "low", "high")] == stated, (task, algorithm)
 
