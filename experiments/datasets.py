@@ -8,13 +8,13 @@ the transitions of ``basic`` (behaviour cloning) and evaluated as any policy; ra
 
 import json
 import os
-import re
 import sys
 from pathlib import Path
 
 import torch
 
 from softgm_bench import dataset
+from softgm_bench.analysis.markdown import refilled
 from softgm_bench.assembly import build_policy, configure
 from softgm_bench.datasets.reading import Dataset, load
 from softgm_bench.envs import entries
@@ -94,11 +94,7 @@ def table() -> str:
 
 def page(text: str) -> str:
     """Make the page's table anew."""
-    made = f"<!-- cloning -->\n\n{table()}\n\n<!-- end -->"
-    text, count = re.subn("<!-- cloning -->.*?<!-- end -->", lambda _: made, text, flags=re.DOTALL)
-    if count != 1:
-        raise SystemExit(f"{PAGE}: one place for the table expected, found {count}")
-    return text
+    return refilled(PAGE, text, {"cloning": table()})
 
 
 def main() -> None:

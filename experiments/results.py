@@ -6,16 +6,17 @@ the tables in ``docs/results.md``, each between ``<!-- table -->`` and ``<!-- en
 """
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
+from softgm_bench.analysis.markdown import refilled
 from softgm_bench.analysis.runs import Columns, Run, find
 from softgm_bench.analysis.statistics import mcnemar
 from softgm_bench.episodes import certified
 from softgm_bench.episodes.summary import wilson_interval
+from softgm_bench.errors import UserError
 
 ROOT = Path(__file__).parents[1]
 RUNS = ROOT / "experiments" / "trained"
@@ -153,12 +154,7 @@ def page(text: str) -> str:
     """``docs/results.md`` with its tables made anew."""
     tables = {task: table(task) for task in TASKS}
     tables |= {name: elsewhere(*settings) for name, settings in ELSEWHERE.items()} | {"failures": failures()}
-    for name, lines in tables.items():
-        made = f"<!-- {name} -->\n\n{lines}\n\n<!-- end -->"
-        text, count = re.subn(rf"<!-- {name} -->.*?<!-- end -->", lambda _, made=made: made, text, flags=re.DOTALL)
-        if count != 1:
-            raise SystemExit(f"{PAGE}: one place for the table of {name} expected, found {count}")
-    return text
+    return refilled(PAGE, text, tables)
 
 
 def draw() -> None:
@@ -198,4 +194,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except UserError as error:
+        raise SystemExit(str(error)) from error

@@ -8,14 +8,15 @@ what lies there is not played again. Then the table in ``docs/trajectories.md`` 
 
 import csv
 import json
-import re
 from pathlib import Path
 from typing import Any
 
+from softgm_bench.analysis.markdown import refilled
 from softgm_bench.assembly import build_env
 from softgm_bench.episodes import folder, policy
 from softgm_bench.episodes.evaluation import evaluate_in_parts
 from softgm_bench.episodes.protocol import Protocol
+from softgm_bench.errors import UserError
 from softgm_bench.rod.pyelastica_backend import PyElasticaBackend
 from softgm_bench.runs.machine import set_threads
 
@@ -71,11 +72,7 @@ def _agreement(ours: list[dict[str, str]], theirs: list[dict[str, str]]) -> list
 
 def page(text: str) -> str:
     """Make the page's table anew."""
-    made = f"<!-- sim to sim -->\n\n{table()}\n\n<!-- end -->"
-    text, count = re.subn("<!-- sim to sim -->.*?<!-- end -->", lambda _: made, text, flags=re.DOTALL)
-    if count != 1:
-        raise SystemExit(f"{PAGE}: one place for the table expected, found {count}")
-    return text
+    return refilled(PAGE, text, {"sim to sim": table()})
 
 
 def episodes(task: str, place: str) -> list[dict[str, str]]:
@@ -101,4 +98,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except UserError as error:
+        raise SystemExit(str(error)) from error

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from interrupted_writing import interrupt_second_chunk
 from softgm_bench import dataset
-from softgm_bench.datasets import chunks
 from softgm_bench.datasets.reading import load
 
 ROOT = Path(__file__).parents[1]
@@ -55,15 +55,7 @@ def test_a_mixture_is_written_with_its_datasheet_and_a_repeated_command_only_com
 
 
 def test_an_interruption_says_how_far_it_came(run, monkeypatch):
-    original, calls = chunks.write, []
-
-    def interrupted(*arguments):
-        calls.append(arguments)
-        if len(calls) == 2:
-            raise KeyboardInterrupt
-        original(*arguments)
-
-    monkeypatch.setattr(chunks, "write", interrupted)
+    interrupt_second_chunk(monkeypatch)
     status, out, err = run("out=x", "task=basic", *QUICK)
     assert (status, out) == (130, "")
     says = "interrupted; whole chunks so far: 1, the same command goes on from there"

@@ -1,6 +1,7 @@
 import pytest
 from small import POLICY, Asked, write
 
+from interrupted_writing import interrupt_second_chunk
 from softgm_bench.datasets import chunks, writing
 from softgm_bench.errors import UserError
 
@@ -19,15 +20,7 @@ def content(folder):
 
 
 def test_an_interrupted_writing_that_goes_on_makes_the_same_bytes(whole, tmp_path, monkeypatch):
-    original, calls = chunks.write, []
-
-    def interrupted(*arguments):
-        calls.append(arguments)
-        if len(calls) == 2:
-            raise KeyboardInterrupt
-        original(*arguments)
-
-    monkeypatch.setattr(chunks, "write", interrupted)
+    interrupt_second_chunk(monkeypatch)
     with pytest.raises(KeyboardInterrupt):
         write(tmp_path / "x", ASKED)
     assert sorted(content(tmp_path / "x")) == ["chunk-00000.tdz", "dataset.json"]

@@ -40,6 +40,25 @@ def observation(lead=(4,), n_agents=4, n_slots=6, seed=0, sensed=0.4, discovered
     return td
 
 
+def relabelled(td, order):
+    """The same observation with its slots in another order."""
+    new = td.clone()
+    new[entries.EDGE] = td[entries.EDGE][..., order]
+    new[entries.SLOT_DESCRIPTOR] = td[entries.SLOT_DESCRIPTOR][..., order, :]
+    new[entries.SLOT_ACTIVE] = td[entries.SLOT_ACTIVE][..., order]
+    return new
+
+
+def with_unsensed_slots_of(td, other):
+    """The observation ``td`` with what ``other`` has in the slots that nobody senses."""
+    unsensed, new = ~td[entries.EDGE].any(dim=-2), td.clone()
+    new[entries.SLOT_DESCRIPTOR] = torch.where(
+        unsensed.unsqueeze(-1), other[entries.SLOT_DESCRIPTOR], td[entries.SLOT_DESCRIPTOR]
+    )
+    new[entries.SLOT_ACTIVE] = torch.where(unsensed, other[entries.SLOT_ACTIVE], td[entries.SLOT_ACTIVE])
+    return new
+
+
 SIZES = Sizes(4, 2, n_slots=6)  # of ``observation()``
 
 

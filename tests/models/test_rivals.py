@@ -13,7 +13,9 @@ from observations import (
     informarl_config,
     observation,
     randomise,
+    relabelled,
     transformer_config,
+    with_unsensed_slots_of,
 )
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
@@ -84,12 +86,7 @@ def test_slots_without_an_edge_change_no_bit(kind, sizes, seed):
     model = encoder(kind, torch.float32, seed)
     td = observation((5,), *sizes, seed=seed)
     other = observation((5,), *sizes, seed=seed + 1)
-    unsensed = ~td[entries.EDGE].any(dim=-2)
-    changed = td.clone()
-    changed[entries.SLOT_DESCRIPTOR] = torch.where(
-        unsensed.unsqueeze(-1), other[entries.SLOT_DESCRIPTOR], td[entries.SLOT_DESCRIPTOR]
-    )
-    changed[entries.SLOT_ACTIVE] = torch.where(unsensed, other[entries.SLOT_ACTIVE], td[entries.SLOT_ACTIVE])
+    changed = with_unsensed_slots_of(td, other)
     assert torch.equal(model(td), model(changed))
     with force_dense():
         assert torch.equal(model(td), model(changed))
@@ -114,12 +111,8 @@ def test_what_nobody_senses_any_more_is_heard_by_those_alone_that_remember(kind)
 def test_relabelling_slots_changes_nothing(kind, sizes, seed):
     model = encoder(kind, seed=seed)
     td = observation((5,), *sizes, seed=seed, dtype=torch.float64)
-    order = torch.randperm(sizes[1])
-    relabelled = td.clone()
-    relabelled[entries.EDGE] = td[entries.EDGE][..., order]
-    relabelled[entries.SLOT_DESCRIPTOR] = td[entries.SLOT_DESCRIPTOR][..., order, :]
-    relabelled[entries.SLOT_ACTIVE] = td[entries.SLOT_ACTIVE][..., order]
-    torch.testing.assert_close(model(td), model(relabelled), rtol=1e-10, atol=1e-10)
+    other = relabelled(td, torch.randperm(sizes[1]))
+    torch.testing.assert_close(model(td), model(other), rtol=1e-10, atol=1e-10)
 
 
 @EVERY

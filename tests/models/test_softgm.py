@@ -4,7 +4,17 @@ import itertools
 import pytest
 import torch
 from hypothesis import given, settings, strategies
-from observations import COUNTS, LEADS, SEEDS, SIZES, observation, randomise, softgm_config
+from observations import (
+    COUNTS,
+    LEADS,
+    SEEDS,
+    SIZES,
+    observation,
+    randomise,
+    relabelled,
+    softgm_config,
+    with_unsensed_slots_of,
+)
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
@@ -102,12 +112,7 @@ def test_slots_without_an_edge_change_no_bit(sizes, seed):
     model = encoder(seed=seed)
     td = observation((5,), *sizes, seed=seed)
     other = observation((5,), *sizes, seed=seed + 1)
-    unsensed = ~td[entries.EDGE].any(dim=-2)
-    changed = td.clone()
-    changed[entries.SLOT_DESCRIPTOR] = torch.where(
-        unsensed.unsqueeze(-1), other[entries.SLOT_DESCRIPTOR], td[entries.SLOT_DESCRIPTOR]
-    )
-    changed[entries.SLOT_ACTIVE] = torch.where(unsensed, other[entries.SLOT_ACTIVE], td[entries.SLOT_ACTIVE])
+    changed = with_unsensed_slots_of(td, other)
     assert torch.equal(model(td), model(changed))
 
 
@@ -116,12 +121,8 @@ def test_slots_without_an_edge_change_no_bit(sizes, seed):
 def test_relabelling_slots_changes_nothing(sizes, seed):
     model = encoder(torch.float64, seed)
     td = observation((5,), *sizes, seed=seed, dtype=torch.float64)
-    order = torch.randperm(sizes[1])
-    relabelled = td.clone()
-    relabelled[entries.EDGE] = td[entries.EDGE][..., order]
-    relabelled[entries.SLOT_DESCRIPTOR] = td[entries.SLOT_DESCRIPTOR][..., order, :]
-    relabelled[entries.SLOT_ACTIVE] = td[entries.SLOT_ACTIVE][..., order]
-    torch.testing.assert_close(model(td), model(relabelled), rtol=1e-12, atol=1e-12)
+    other = relabelled(td, torch.randperm(sizes[1]))
+    torch.testing.assert_close(model(td), model(other), rtol=1e-12, atol=1e-12)
 
 
 @settings(max_examples=20, deadline=None)

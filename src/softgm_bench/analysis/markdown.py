@@ -1,8 +1,11 @@
 """A report as Markdown, for GitHub; figures are files beside it."""
 
 import re
+from collections.abc import Mapping
+from pathlib import Path
 
 from softgm_bench.analysis.document import Cell, Document, Figure, Table, written
+from softgm_bench.errors import UserError
 
 
 def render(document: Document) -> str:
@@ -11,6 +14,21 @@ def render(document: Document) -> str:
     for title, blocks in document.sections:
         parts += [f"## {title}", *written(blocks, _escape, _table, _figure)]
     return "\n\n".join(parts) + "\n"
+
+
+def refilled(page: Path, text: str, tables: Mapping[str, str]) -> str:
+    """Put tables anew into a page's text, each between ``<!-- name -->`` and ``<!-- end -->``.
+
+    Raises:
+        UserError: naming the page, if a name does not stand there exactly once.
+    """
+    for name, lines in tables.items():
+        made = f"<!-- {name} -->\n\n{lines}\n\n<!-- end -->"
+        literal = made.replace("\\", "\\\\")  # no group of the pattern is meant
+        text, count = re.subn(rf"<!-- {name} -->.*?<!-- end -->", literal, text, flags=re.DOTALL)
+        if count != 1:
+            raise UserError(f"{page}: one place for the table of {name} expected, found {count}")
+    return text
 
 
 def _figure(figure: Figure) -> str:

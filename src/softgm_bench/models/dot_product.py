@@ -10,7 +10,7 @@ sensed by agents that are far apart carries no message between them. One sum, tw
 
 import math
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -22,6 +22,19 @@ from softgm_bench.models import graph
 from softgm_bench.models.dot_product_kernel import DotProductAttention
 from softgm_bench.rod import sync
 from softgm_bench.upstream import functorch
+
+
+def check_sizes(config: Any, *counts: str) -> None:
+    """Refuse sizes that give no network; heads share ``hidden``.
+
+    Raises:
+        ValueError: with one line naming the key, its value and what would be right.
+    """
+    for name in ("hidden", "heads", *counts):
+        if getattr(config, name) < 1:
+            raise ValueError(f"model.{name} is {getattr(config, name)}: it must be at least 1")
+    if config.hidden % config.heads:
+        raise ValueError(f"model.hidden is {config.hidden}: it must be a multiple of model.heads, {config.heads}")
 
 
 class Hearing(NamedTuple):

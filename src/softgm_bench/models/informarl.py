@@ -65,11 +65,7 @@ class InforMARLConfig:
         Raises:
             ValueError: with one line naming the key, its value and what would be right.
         """
-        for name in ("hidden", "heads", "layers", "type_embedding", "embedding_layers"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"model.{name} is {getattr(self, name)}: it must be at least 1")
-        if self.hidden % self.heads:
-            raise ValueError(f"model.hidden is {self.hidden}: it must be a multiple of model.heads, {self.heads}")
+        dot_product.check_sizes(self, "layers", "type_embedding", "embedding_layers")
 
 
 class GraphTransformer(nn.Module):

@@ -67,11 +67,7 @@ class SectionTransformerConfig:
         Raises:
             ValueError: with one line naming the key, its value and what would be right.
         """
-        for name in ("hidden", "heads", "layers", "feedforward"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"model.{name} is {getattr(self, name)}: it must be at least 1")
-        if self.hidden % self.heads:
-            raise ValueError(f"model.hidden is {self.hidden}: it must be a multiple of model.heads, {self.heads}")
+        dot_product.check_sizes(self, "layers", "feedforward")
 
 
 @register_model(
