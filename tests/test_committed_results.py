@@ -177,6 +177,17 @@ def test_a_coarse_torque_field_goes_through_the_policys_own_at_fewer_control_poi
         assert f"{100 * (coarse.coarse_matrix(trained, sections) - whole).norm() / whole.norm():.0f}" == share
 
 
+def test_committed_evaluations_count_the_scenes_that_are_certified_today():
+    recertify = script(ROOT / "experiments" / "recertify.py")
+    folders = list(recertify.evaluations())
+    assert len(folders) >= 10
+    for folder in folders:
+        rows, summary = recertify.marked(folder)
+        assert json.loads((folder / "summary.json").read_text()) == json.loads(json.dumps(summary)), folder
+        with (folder / "episodes.csv").open(newline="") as file:
+            assert list(csv.DictReader(file)) == rows, folder
+
+
 INTERVENTIONS = {
     "what agents have sensed": "none",
     "no obstacle": "blind",
