@@ -3,6 +3,7 @@ import importlib.util
 import itertools
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -51,6 +52,40 @@ def test_the_tables_of_the_results_are_made_from_the_committed_runs(results):
 
 
 @pytest.fixture(scope="module")
+def campaign():
+    return script(ROOT / "experiments" / "campaign.py")
+
+
+def test_every_run_of_the_campaign_is_a_cell_at_its_budget_and_the_page_names_what_is_missing(campaign):
+    page = campaign.PAGE.read_text()
+    assert campaign.page(page) == page
+    wanted = {cell for grid in campaign.GRIDS for cell in campaign.cells(grid)}
+    missing = wanted - set(campaign.runs())
+    table = page.partition("<!-- campaign cells -->")[2].partition("<!-- end -->")[0]
+    assert table.count(campaign.MISSING) == len(missing)
+    assert f"{len(wanted) - len(missing)} of {len(wanted)} cells are there" in table
+
+
+def test_the_cells_of_a_task_have_equal_budgets_whatever_the_algorithm(campaign):
+    for run in campaign.runs().values():
+        settings = campaign.asked(run.final.task)
+        assert settings["frames"] <= run.final.frames < settings["frames"] + 20_000, run.final.folder
+        assert len(run.final.episodes["success"]) == settings["episodes"] == 1000
+
+
+def test_a_run_that_is_shorter_than_its_cell_is_no_part_of_the_campaign(campaign, monkeypatch, tmp_path):
+    folder = tmp_path / "campaign" / "wall" / "softgm" / "seed0"
+    shutil.copytree(campaign.CAMPAIGN / "wall" / "softgm" / "seed0", folder)
+    config = folder / "config.yaml"
+    config.write_text(config.read_text().replace("total_frames: 3000000", "total_frames: 2000000"))
+    monkeypatch.setattr(campaign, "CAMPAIGN", tmp_path / "campaign")
+    campaign.runs.cache_clear()
+    with pytest.raises(SystemExit, match=r"^wall/softgm/seed0: it has .*2000000.* the cell .*3000000"):
+        campaign.runs()
+    campaign.runs.cache_clear()
+
+
+@pytest.fixture(scope="module")
 def sim_to_sim():
     return script(ROOT / "experiments" / "sim_to_sim.py")
 
@@ -80,19 +115,20 @@ def test_a_kept_policy_belongs_to_a_committed_run(path, results):
 
 
 @pytest.mark.parametrize(
-    ("trial", "frames", "name"),
+    ("evaluations", "frames", "name"),
     [
-        ("envs-128_promote-0.5_entropy-0.003", 2_400_000, "gamma 0.95"),
-        ("tuned", 3_001_600, "gamma 0.98"),
+        ("trials/wall/envs-128_promote-0.5_entropy-0.003/policy-2400000", 2_400_000, "gamma 0.95"),
+        ("campaign/wall/softgm/seed0/evaluations", 3_001_600, "gamma 0.98"),
     ],
 )
-def test_a_kept_trial_is_the_policy_of_its_evaluations_and_the_page_says_what_they_hold(results, trial, frames, name):
+def test_a_kept_policy_is_that_of_its_evaluations_and_the_page_says_what_they_hold(results, evaluations, frames, name):
     page = results.PAGE.read_text()
-    folder = ROOT / f"experiments/trials/wall/{trial}/policy-{frames // 100_000}00000"
-    assert policy.load(folder.with_suffix(".pt")).frames == frames
+    folder = ROOT / "experiments" / evaluations
+    kept = folder.with_name("policy.pt") if folder.name == "evaluations" else folder.with_suffix(".pt")
+    assert policy.load(kept).frames == frames
     rows = {"none": "what agents have sensed", "blind": "no obstacle", "swap_obstacles": "another scene's obstacles"}
     summaries = [json.loads((folder / intervention / "summary.json").read_text()) for intervention in rows]
-    assert len({summary["policy"] for summary in summaries}) == 1
+    assert {summary["policy"] for summary in summaries} == {policy.fingerprint(policy.load(kept))}
     for (intervention, shown), summary in zip(rows.items(), summaries, strict=True):
         assert (summary["intervention"], summary["frames"]) == (intervention, frames)
         metrics = summary["metrics"]
@@ -117,7 +153,7 @@ def test_the_published_policies_that_a_kept_trial_is_compared_with_played_the_sa
 
 
 def test_what_the_walls_recipe_reached_is_its_runs_own_final_evaluation(results):
-    folder = ROOT / "experiments/trials/wall/tuned"
+    folder = ROOT / "experiments/campaign/wall/softgm/seed0"
     final = json.loads((folder / "summary.json").read_text())["final_evaluation"]
     success = final["success_rate"]
     told = f"{success['mean']:.3f} [{success['low']:.3f}, {success['high']:.3f}] of {final['episodes']} scenes, "
