@@ -4,6 +4,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 from tensordict import TensorDictBase
@@ -15,6 +16,8 @@ from softgm_bench.envs.interface import Sizes
 from softgm_bench.models import graph
 from softgm_bench.models.activation import tanh
 from softgm_bench.models.registry import Encoder, TeamEncoder, register_model
+from softgm_bench.rod import sync
+from softgm_bench.upstream import functorch
 
 
 @dataclass
@@ -52,18 +55,27 @@ class MLPTeamEncoder(TeamEncoder):
         """Draw the parameters for N agents, M slots and ``n_further`` inputs besides."""
         super().__init__(config.hidden)
         self.velocity_scale = config.velocity_scale
-        of_agents = sizes.n_agents * (graph.CHANNELS + sizes.n_slots)
-        in_features = of_agents + sizes.n_slots * graph.CHANNELS + n_further
-        self.layers = nn.ModuleList(orthogonal_layers([in_features, *[config.hidden] * config.layers]))
+        n_agents, n_slots = sizes.n_agents, sizes.n_slots
+        self.parts = [n_agents * graph.CHANNELS, n_agents * n_slots, n_slots * graph.CHANNELS, n_further]
+        self.layers = nn.ModuleList(orthogonal_layers([sum(self.parts), *[config.hidden] * config.layers]))
 
     def forward(self, td: TensorDictBase, further: Tensor) -> Tensor:
         """Embeddings ``(..., hidden)`` of own nodes, edges, slots and ``further``, in this order."""
         own = graph.agent_channels(td, self.velocity_scale)
+        td = _without_zeros(td)
         edge, slots = td[entries.EDGE].to(own.dtype), graph.slot_channels(td)
-        hidden = torch.cat([own.flatten(-2), edge.flatten(-2), slots.flatten(-2), further], dim=-1)
-        for layer in self.layers:
+        inputs = torch.cat([own.flatten(-2), edge.flatten(-2), slots.flatten(-2), further], dim=-1)
+        first, *rest = cast("list[nn.Linear]", list(self.layers))
+        hidden = tanh(functional.linear(inputs, self._read(first.weight, *edge.shape[-2:]), first.bias))
+        for layer in rest:
             hidden = tanh(layer(hidden))
         return hidden
+
+    def _read(self, weight: Tensor, n_agents: int, n_slots: int) -> Tensor:
+        """The first layer's columns that the first ``n_slots`` slots are read with, and all others."""
+        own, edge, slots, further = weight.split(self.parts, dim=1)
+        edge = edge.unflatten(1, (n_agents, -1))[..., :n_slots].flatten(1)
+        return torch.cat([own, edge, slots[:, : n_slots * graph.CHANNELS], further], dim=1)
 
 
 @register_model("mlp", config=MLPConfig, team=MLPTeamEncoder)
@@ -83,20 +95,27 @@ class MLPEncoder(Encoder):
 
     def forward(self, td: TensorDictBase) -> Tensor:
         """Embeddings ``(..., N, hidden)`` from the entries ``entries.OBSERVATION``."""
-        edge = td[entries.EDGE]
-        n_slots = edge.shape[-1]
+        n_slots = td[entries.EDGE].shape[-1]
         own = graph.agent_channels(td, self.velocity_scale)
         own_weight, slot_weight, edge_weight = self.first.weight.split(
             [graph.CHANNELS, n_slots * graph.CHANNELS, n_slots], dim=1
         )
-        shared = functional.linear(graph.slot_channels(td).flatten(-2), slot_weight, self.first.bias)
+        td = _without_zeros(td)
+        edge, slots = td[entries.EDGE].to(own.dtype), graph.slot_channels(td).flatten(-2)
+        shared = functional.linear(slots, slot_weight[:, : slots.shape[-1]], self.first.bias)
         # One product for the agent's own two parts.
-        private = torch.cat([own, edge.to(own.dtype)], dim=-1)
-        hidden = functional.linear(private, torch.cat([own_weight, edge_weight], dim=1)) + shared.unsqueeze(-2)
+        own_weight = torch.cat([own_weight, edge_weight[:, : edge.shape[-1]]], dim=1)
+        hidden = functional.linear(torch.cat([own, edge], dim=-1), own_weight) + shared.unsqueeze(-2)
         hidden = tanh(hidden)
         for layer in self.rest:
             hidden = tanh(layer(hidden))
         return hidden
+
+
+def _without_zeros(td: TensorDictBase) -> TensorDictBase:
+    """The observation without slots that are empty in the whole batch, where that may be asked: often most of them."""
+    free = sync.is_free(td[entries.EDGE].device) and not functorch.transforms_active()
+    return graph.without_empty_slots(td) if free else td
 
 
 def orthogonal_layers(sizes: Sequence[int]) -> list[nn.Linear]:
