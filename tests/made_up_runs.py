@@ -51,6 +51,7 @@ def write_run(
     observation: str = "standard",
     curriculum: bool = False,
     perturbation: str = "none",
+    recipe: str = "tuned",
 ) -> Path:
     """A finished run; its evaluations during training rise to ``success``."""
     folder = root / task / label / f"seed{seed}"
@@ -66,6 +67,7 @@ def write_run(
     (folder / "evaluations.jsonl").write_text("".join(json.dumps(entry) + "\n" for entry in evaluations))
     (folder / "metrics.csv").write_text(f"iteration,frames\n1,{frames}\n")
     config = {
+        "recipe": recipe,
         "task": {"name": task, "horizon": 2000, "curriculum": {"enabled": curriculum}},
         "perturbation": {"name": perturbation},
         "experiment": {"evaluation": {"horizon": 200, "final_horizon": None}},

@@ -77,6 +77,7 @@ def test_an_evaluation_leaves_its_episodes_and_a_summary_of_them(run, tmp_path):
         "algo": "softgm",
         "model": "softgm",
         "observation": "standard",
+        "recipe": "",  # kept before recipes had names
         "seed": 0,
         "perturbation": {
             "name": "noise",

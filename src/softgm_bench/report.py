@@ -1,6 +1,7 @@
 """Make the paper's tables and figures from runs: ``softgm-bench report RUNS_FOLDER [key=value ...]``.
 
-Writes ``report.md``, ``report.tex``, ``report.html`` (needs no other file), ``figures/`` for the first two,
+Writes ``report.md``, ``report.tex``, ``report.html`` (needs no other file), ``figures/`` for the first two, the paper's
+two tables for a paper of your own (``table1.tex``, ``table2.tex`` and both ``_compact``, for one column),
 ``marl_eval.json`` and ``made_with.json``. The same runs give the same bytes.
 
 Settings:
@@ -69,6 +70,7 @@ def report(arguments: list[str]) -> None:
     files = {
         "report.md": markdown.render(document).encode(),
         "report.tex": latex.render(document).encode(),
+        **{name: text.encode() for name, text in latex.for_papers(document).items()},
         "report.html": html.render(document).encode(),
         "marl_eval.json": (to_json(export(newest(found.runs)[0]), indent=1) + "\n").encode(),
         "made_with.json": (json.dumps(made_with, indent=1) + "\n").encode(),

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from made_up_runs import write_run
+from softgm_bench.analysis import figures
 from softgm_bench.analysis.aggregate import THRESHOLDS, aggregates, comparisons, success_rates
 from softgm_bench.analysis.pools import newest, pool_runs
 from softgm_bench.analysis.runs import find
@@ -22,6 +23,18 @@ def pools(tmp_path_factory):
         write_run(root, task, "softgm_no_stage1", 0)
     write_run(root, "basic", "mappo", 0, success=0.5)
     write_run(root, "wall", "softgm_oracle", 0, observation="oracle")
+    return pool_runs(newest(find(root).runs)[0])
+
+
+@pytest.fixture(scope="module")
+def three_seeds(tmp_path_factory):
+    """SoftGM and IPPO on every task, IPPO with other frames on one; MAPPO on one task; three seeds each."""
+    root = tmp_path_factory.mktemp("runs")
+    for seed in range(3):
+        for task in TASKS:
+            write_run(root, task, "softgm", seed, success=0.9)
+            write_run(root, task, "ippo", seed, success=0.3, frames=2_000_000 if task != "wall" else 1_900_000)
+        write_run(root, "basic", "mappo", seed, success=0.6)
     return pool_runs(newest(find(root).runs)[0])
 
 
@@ -46,13 +59,20 @@ def test_aggregates_are_of_the_success_rates_of_runs(pools):
     assert rates.min() <= low <= entry.iqm.value <= high <= rates.max()
 
 
-def test_each_pair_is_compared_once_over_the_tasks_that_both_have(pools):
-    pairs = {(pair.first, pair.second): pair for pair in comparisons(pools, BOOTSTRAP)}
+def test_each_pair_is_compared_once_over_the_tasks_on_which_both_are_comparable(three_seeds):
+    pairs = {(pair.first, pair.second): pair for pair in comparisons(three_seeds, BOOTSTRAP)}
     assert set(pairs) == {("mappo", "ippo"), ("softgm", "ippo"), ("softgm", "mappo")}
-    assert pairs["softgm", "ippo"].tasks == TASKS
+    assert pairs["softgm", "ippo"].tasks == ("basic", "structured")  # IPPO had fewer frames on the third
     assert pairs["softgm", "mappo"].tasks == ("basic",)
     assert pairs["softgm", "ippo"].estimate.value == 1.0
-    assert all(pair.estimate.interval is None for pair in pairs.values())  # the second has one seed
+    assert all(pair.estimate.interval is not None for pair in pairs.values())
+    drawn = figures.improvement(list(pairs.values()))
+    assert drawn.key == "probability_of_improvement"
+    assert drawn.svg.count("SoftGM") >= 1
+
+
+def test_with_fewer_seeds_than_three_none_is_compared(pools):
+    assert comparisons(pools, BOOTSTRAP) == []
 
 
 def test_a_profile_falls_from_all_runs_to_none(pools):

@@ -1,7 +1,7 @@
 import pytest
 
 from made_up_runs import write_evaluation, write_run
-from softgm_bench.analysis.pools import newest, pool_evaluations, pool_runs, wilson
+from softgm_bench.analysis.pools import comparable, newest, pool_evaluations, pool_runs, wilson
 from softgm_bench.analysis.runs import find
 from softgm_bench.analysis.statistics import Bootstrap
 
@@ -94,3 +94,30 @@ def test_evaluations_are_pooled_by_condition_and_other_settings_are_not(tmp_path
         "noise (position sigma 0.1)": 2,
         "noise (position sigma 0.2)": 1,
     }
+
+
+def test_algorithms_are_comparable_with_three_seeds_and_frames_that_are_equal_but_for_rounding(tmp_path):
+    for seed in range(3):
+        write_run(tmp_path, "basic", "softgm", seed, frames=1_000_000)
+        write_run(tmp_path, "basic", "masac", seed, frames=1_011_200)
+        write_run(tmp_path, "basic", "mappo", seed, frames=1_100_000)
+        if seed < 2:
+            write_run(tmp_path, "basic", "ippo", seed, frames=1_000_000)
+    pools = pools_of(tmp_path)
+    softgm = pools["basic", "softgm"]
+    rivals = ("masac", "mappo", "ippo")
+    assert [comparable(softgm, pools["basic", name]) for name in rivals] == [True, False, False]
+
+
+def test_another_recipe_is_another_row_that_is_not_ranked(tmp_path):
+    write_run(tmp_path / "tuned", "basic", "softgm", 0, frames=1_000_000)
+    write_run(tmp_path / "paper", "basic", "softgm", 0, frames=2_000_000, recipe="paper")
+    write_run(tmp_path / "old", "basic", "mappo", 0, recipe="open")
+    pools = pools_of(tmp_path)
+    assert {label: (pool.recipe, pool.ranked) for (_, label), pool in pools.items()} == {
+        "softgm": ("tuned", True),
+        "softgm_paper": ("paper", False),
+        "mappo": ("tuned", True),
+    }
+    assert pools["basic", "softgm"].frames == [1_000_000]
+    assert pools["basic", "softgm"].minutes == (10.0,)

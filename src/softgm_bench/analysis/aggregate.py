@@ -7,7 +7,7 @@ import numpy as np
 
 from softgm_bench.analysis import statistics
 from softgm_bench.analysis.paper import ABLATIONS, ALGORITHMS, TASKS
-from softgm_bench.analysis.pools import Pools
+from softgm_bench.analysis.pools import Pools, comparable
 from softgm_bench.analysis.statistics import Array, Bootstrap
 
 THRESHOLDS = np.linspace(0.0, 1.0, 101)
@@ -85,11 +85,15 @@ def _profile(scores: statistics.Scores) -> Array:
 
 
 def comparisons(pools: Pools, bootstrap: Bootstrap) -> list[Comparison]:
-    """Compare every two competitors with a task in common, in the order in which the first is not less probable."""
+    """Compare every two competitors on the tasks on which they are ``comparable``.
+
+    Each pair stands once, in the order in which the first is not less probable.
+    """
     found = []
     rates, statistic = success_rates(pools), statistics.probability_of_improvement
     for first, second in permutations(rates, 2):
-        tasks = tuple(task for task in TASKS if task in rates[first] and task in rates[second])
+        shared = [task for task in TASKS if task in rates[first] and task in rates[second]]
+        tasks = tuple(task for task in shared if comparable(pools[task, first], pools[task, second]))
         ours, theirs = ([rates[label][task] for task in tasks] for label in (first, second))
         value = float(statistic(ours, theirs)) if tasks else 0.0
         if value > 0.5 or (value == 0.5 and first < second):

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Sequence
 
 from softgm_bench.analysis import aggregate, figures, interventions, names, paper, tables
 from softgm_bench.analysis.document import Block, Document, Section
-from softgm_bench.analysis.pools import Pools, by_algorithm, by_condition, newest, pool_evaluations, pool_runs
+from softgm_bench.analysis.pools import SEEDS, Pools, by_algorithm, by_condition, newest, pool_evaluations, pool_runs
 from softgm_bench.analysis.runs import Found, Run
 from softgm_bench.analysis.statistics import Bootstrap
 from softgm_bench.analysis.style import look
@@ -16,6 +16,9 @@ TITLE = "Report of softgm_bench"
 ONE_SEED = (
     "Of one seed no interval over seeds can be given: its interval is Wilson's over the episodes of that one policy "
     "and says nothing about how seeds differ."
+)
+NONE_COMPARED = (
+    f"No two algorithms have {SEEDS} seeds at equal frames on the same task: no probability of improvement is given."
 )
 TORQUE = (
     "Torque. The paper's formula averages a single agent's torque (at most 25 √2 = 35.4 N m); its tables hold values "
@@ -122,7 +125,7 @@ def _over_tasks(pools: Pools, bootstrap: Bootstrap) -> list[Block | None]:
         tables.aggregates(entries),
         figures.aggregate_scores(entries),
         figures.performance_profiles(entries) or "No algorithm was run on all three tasks: no performance profile.",
-        tables.comparisons(pairs) if pairs else "No two algorithms were run on the same task: none can be compared.",
+        tables.comparisons(pairs) if pairs else NONE_COMPARED,
         figures.improvement(pairs),
     ]
 
@@ -131,9 +134,9 @@ def _method(bootstrap: Bootstrap) -> list[Block | None]:
     return [
         "Mean ± standard deviation: over all episodes of all seeds together (population). Success: mean over seeds of "
         "a seed's share of successful episodes; an episode that diverged is none. Ranks compare success rates on one "
-        "task; an oracle, training under a perturbation and runs of smoke size are never ranked, training with a "
-        "curriculum only where "
-        "every ranked run had one.",
+        f"task, and need {SEEDS} seeds and equal frames, as probabilities of improvement do; an oracle, another recipe "
+        "than the tuned one, training under a perturbation and runs of smoke size are never ranked, training with a "
+        "curriculum only where every ranked run had one.",
         f"Intervals cover 95 %. Over seeds: percentiles of a stratified bootstrap ({bootstrap.resamples:,} resamples, "
         f"seed {bootstrap.seed}), which draws runs with replacement within each task (Agarwal et al. 2021). Of a "
         "single policy: Wilson's score interval over its episodes.",

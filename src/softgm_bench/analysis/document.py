@@ -72,6 +72,11 @@ class Document(NamedTuple):
         """All figures in order."""
         return [block for section in self.sections for block in section.blocks if isinstance(block, Figure)]
 
+    @property
+    def tables(self) -> list[Table]:
+        """All tables in order."""
+        return [block for section in self.sections for block in section.blocks if isinstance(block, Table)]
+
 
 def written(blocks: Sequence[Block], *writers: Callable[..., str]) -> list[str]:
     """Each block as one format's writers of a paragraph, a table and a figure, in this order, write its kind."""

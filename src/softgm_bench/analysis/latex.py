@@ -14,6 +14,18 @@ PREAMBLE = r"""\documentclass[a4paper,10pt]{article}
 \newcommand{\muted}[1]{\textcolor{black!55}{#1}}
 """
 ROWS_ON_A_PAGE = 24
+# Tables for a paper of one's own: which of the report's, and the columns of the narrow form, group and name.
+FOR_PAPERS = {"table1": "one-", "table2": "two"}
+NARROW = (
+    ("", "Task"),
+    ("", "Algorithm"),
+    ("", "Condition"),
+    ("Success, %", "ours"),
+    ("Success, %", "95 % interval"),
+    ("Success, %", "paper"),
+    ("Episode length", "ours"),
+)
+WIDE_SIZE, NARROW_SIZE = r"\scriptsize", r"\footnotesize"
 SYMBOLS = {
     "\\": r"\textbackslash{}",
     "{": r"\{",
@@ -53,6 +65,44 @@ def render(document: Document) -> str:
     return "\n\n".join([*parts, r"\end{document}"]) + "\n"
 
 
+def for_papers(document: Document) -> dict[str, str]:
+    """Tables I and II by file name, each to be included in a paper: two columns wide, and ``_compact`` for one column.
+
+    They need booktabs and xcolor and are set in a small size, not scaled. What was not run at all is left out, and so
+    are the columns that only ``report.tex`` has room for.
+    """
+    files = {}
+    for name, prefix in FOR_PAPERS.items():
+        tables = [table for table in document.tables if table.key.startswith(prefix)]
+        for narrow in (False, True):
+            parts = [part for table in tables if (part := _for_paper(table, narrow)) is not None]
+            files[f"{name}{'_compact' if narrow else ''}.tex"] = "\n\n".join(parts or ["% nothing was run"]) + "\n"
+    return files
+
+
+def _for_paper(table: Table, narrow: bool) -> str | None:
+    rows = [row for row in table.rows if not any(cell.text == "not run" for cell in row)]
+    if not rows:
+        return None
+    wide = [place for place, column in enumerate(table.columns) if column.name not in ("recipe", "minutes", "rank")]
+    kept = [place for place in wide if not narrow or table.columns[place][:2][::-1] in NARROW]
+    columns = [table.columns[place] for place in kept]
+    chosen = table._replace(columns=columns, rows=[[row[place] for place in kept] for row in rows])
+    kind, label = ("table", f"tab:{table.key}-compact") if narrow else ("table*", f"tab:{table.key}")
+    lines = [
+        rf"\begin{{{kind}}}",
+        r"\centering",
+        NARROW_SIZE if narrow else WIDE_SIZE,
+        r"\setlength{\tabcolsep}{3pt}",
+        rf"\caption{{{escape(table.caption)}}}",
+        rf"\label{{{label}}}",
+        *_tabular(chosen, chosen.rows),
+        *(rf"\par\smallskip\parbox{{\linewidth}}{{{escape(note)}}}" for note in table.notes),
+        rf"\end{{{kind}}}",
+    ]
+    return "\n".join([r"\providecommand{\muted}[1]{\textcolor{black!55}{#1}}", *lines])
+
+
 def escape(text: str) -> str:
     """Write LaTeX's own and other special characters as commands, and ``?`` for one that is not known."""
     return "".join(SYMBOLS.get(character, character) for character in text).encode("ascii", "replace").decode()
@@ -82,19 +132,26 @@ def _part(table: Table, start: int) -> str:
     notes = table.notes if end >= len(table.rows) else []
     lines = [
         r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%",
-        rf"\begin{{tabular}}{{{''.join('r' if column.numeric else 'l' for column in table.columns)}}}",
-        r"\toprule",
-        *_headings(table),
-        r"\midrule",
-        *(_row(map(_cell, row)) for row in table.rows[start:end]),
-        r"\bottomrule",
-        r"\end{tabular}}",
+        *_tabular(table, table.rows[start:end]),
+        "}",
         *(rf"\par\smallskip\parbox{{\linewidth}}{{\footnotesize {escape(note)}}}" for note in notes),
     ]
     caption, label = table.caption, f"tab:{table.key}"
     if start:
         caption, label = f"{caption} (continued)", f"{label}-{start}"
     return _float("table", caption, label, after=lines)
+
+
+def _tabular(table: Table, rows: Iterable[Iterable[Cell]]) -> list[str]:
+    return [
+        rf"\begin{{tabular}}{{{''.join('r' if column.numeric else 'l' for column in table.columns)}}}",
+        r"\toprule",
+        *_headings(table),
+        r"\midrule",
+        *(_row(map(_cell, row)) for row in rows),
+        r"\bottomrule",
+        r"\end{tabular}",
+    ]
 
 
 def _headings(table: Table) -> list[str]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from softgm_bench.analysis import paper
-from softgm_bench.analysis.runs import Evaluation, Run
+from softgm_bench.analysis.runs import TUNED, Evaluation, Run
 from softgm_bench.analysis.statistics import Array, Bootstrap, mean
 
 ORACLE, CURRICULUM, PERTURBED, SMOKE = "†", "‡", "§", "¶"
@@ -17,6 +17,8 @@ MARKS = {
     SMOKE: "of smoke size: every part of a training once, which teaches nothing",
 }
 UNRANKED = {ORACLE, PERTURBED, SMOKE}
+SEEDS = 3  # that an algorithm needs to be compared with another
+ROUNDING = 1.02  # of the most frames to the fewest that count as equal: trainings end with a whole iteration
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,11 +29,15 @@ class Pool:
         evaluations: by seed.
         marks: how the training was another kind's.
         ranked: whether it competes with the others on its task.
+        recipe: the trainings' hyperparameters; empty if that is not known.
+        minutes: of each training; empty if they are not known.
     """
 
     evaluations: tuple[Evaluation, ...]
     marks: str = ""
     ranked: bool = True
+    recipe: str = ""
+    minutes: tuple[float, ...] = ()
 
     @property
     def label(self) -> str:
@@ -42,6 +48,11 @@ class Pool:
     def seeds(self) -> int:
         """Number of trained policies."""
         return len(self.evaluations)
+
+    @property
+    def frames(self) -> list[int]:
+        """That each policy was trained with."""
+        return [evaluation.frames for evaluation in self.evaluations]
 
     @property
     def success_rates(self) -> Array | None:
@@ -82,6 +93,17 @@ Pools = Mapping[tuple[str, str], Pool]
 Conditions = Mapping[tuple[str, str], Sequence[tuple[str, Pool | None]]]
 
 
+def equal_frames(pools: Sequence[Pool]) -> bool:
+    """Tell whether all trainings of several pools had as many frames, but for rounding."""
+    frames = [frames for pool in pools for frames in pool.frames]
+    return max(frames, default=0) <= ROUNDING * min(frames, default=0)
+
+
+def comparable(*pools: Pool) -> bool:
+    """Tell whether algorithms can be compared: each has ``SEEDS`` seeds or more, and all had equal frames."""
+    return all(pool.seeds >= SEEDS for pool in pools) and equal_frames(pools)
+
+
 def wilson(evaluation: Evaluation) -> tuple[float, float]:
     """95 % interval of one policy's success rate over its episodes."""
     from softgm_bench.episodes.summary import wilson_interval  # brings torch along
@@ -116,16 +138,18 @@ def by_algorithm(runs: Sequence[Run]) -> dict[tuple[str, str], list[Run]]:
 def pool_runs(runs: Sequence[Run]) -> dict[tuple[str, str], Pool]:
     """Pool final evaluations by task and algorithm; algorithms that differ in kind have different names.
 
-    Ranked are runs of more than smoke size, without the oracle and trained without perturbation. Where some were
-    trained with a curriculum and others were not, those with it are not ranked.
+    Ranked are runs of more than smoke size, with the tuned recipe, without the oracle and trained without perturbation.
+    Where some of them were trained with a curriculum and others were not, those with it are not ranked.
     """
     pools = {}
     for key, members in by_algorithm(sorted(runs, key=lambda run: (run.final.seed, run.final.folder))).items():
         kinds = set().union(*map(_kinds, members))
-        rivals = [_kinds(run) for run in runs if run.final.task == key[0]]
+        rivals = [_kinds(run) for run in runs if run.final.task == key[0] and run.recipe == TUNED]
         fair = all(CURRICULUM in rival for rival in rivals if not rival & UNRANKED)
-        ranked = not kinds & UNRANKED and (CURRICULUM not in kinds or fair)
-        pools[key] = Pool(tuple(run.final for run in members), "".join(mark for mark in MARKS if mark in kinds), ranked)
+        ranked = not kinds & UNRANKED and members[0].recipe == TUNED and (CURRICULUM not in kinds or fair)
+        finals, minutes = tuple(run.final for run in members), tuple(run.minutes for run in members)
+        marks = "".join(mark for mark in MARKS if mark in kinds)
+        pools[key] = Pool(finals, marks, ranked, members[0].recipe, minutes)
     return pools
 
 

@@ -24,6 +24,7 @@ from softgm_bench.storage.run_folder import RunFolder
 
 Columns = Mapping[str, NDArray[np.float64]]
 SMOKE_FRAMES = 10_000  # a smoke run has 384
+TUNED = "tuned"  # the recipe that labels do not name
 TRUTH = {"True": 1.0, "False": 0.0, "": float("nan")}
 
 
@@ -34,7 +35,7 @@ class Evaluation:
     Attributes:
         folder: the source, below the folder that was searched, whose name comes first.
         task: that the episodes are of.
-        label: the algorithm, with what makes its results another kind's.
+        label: the algorithm, with what makes its results another kind's, a recipe other than the tuned one too.
         seed: of the training.
         frames: that it was trained with.
         episodes: by column of ``episodes.csv``, ``(episodes,)``; truth values are 0 and 1.
@@ -100,6 +101,16 @@ class Run:
     def trained_with(self) -> str:
         """Perturbation during training, ``none`` without."""
         return (self.config.get("perturbation") or {}).get("name", "none")
+
+    @property
+    def recipe(self) -> str:
+        """Name of the hyperparameters."""
+        return _recipe(self.config)
+
+    @property
+    def minutes(self) -> float:
+        """That the training took."""
+        return self.summary["wall_time"] / 60
 
     @property
     def progress_horizon(self) -> int:
@@ -180,12 +191,13 @@ def _source(folder: RunFolder, name: str) -> Run | Evaluation:
     trained = "final_evaluation" in summary or "perturbation" not in summary
     _compare(episodes, summary["final_evaluation" if trained else "metrics"])
     config: Any = OmegaConf.to_container(OmegaConf.load(folder.config)) if trained else None
+    recipe = _recipe(summary if config is None else config)
     perturbation = summary.get("perturbation", "none")
     horizon = _final_horizon(config) if trained else summary.get("horizon") or _longest_failure(episodes)
     evaluation = Evaluation(
         folder=name,
         task=summary["task"],
-        label=summary["algo"],
+        label=summary["algo"] + ("" if recipe == TUNED else f"_{recipe}"),
         seed=summary["seed"],
         frames=summary["frames"],
         episodes=episodes,
@@ -203,6 +215,12 @@ def _source(folder: RunFolder, name: str) -> Run | Evaluation:
         },
     )
     return Run(evaluation, summary, config, _progress(folder)) if trained else evaluation
+
+
+def _recipe(told: Mapping[str, Any]) -> str:
+    """The recipe that a config or a summary tells; earlier ones do not, or call the tuned one open."""
+    recipe = told.get("recipe") or TUNED
+    return TUNED if recipe == "open" else recipe
 
 
 def _final_horizon(config: Mapping[str, Any]) -> int:

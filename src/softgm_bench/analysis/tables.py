@@ -8,11 +8,22 @@ from softgm_bench.analysis import names, paper
 from softgm_bench.analysis.aggregate import Aggregate, Comparison, Estimate
 from softgm_bench.analysis.document import Cell, Column, Table
 from softgm_bench.analysis.interventions import Pair
-from softgm_bench.analysis.pools import MARKS, Conditions, Pool, Pools, condition, wilson
+from softgm_bench.analysis.pools import (
+    MARKS,
+    SEEDS,
+    Conditions,
+    Pool,
+    Pools,
+    comparable,
+    condition,
+    equal_frames,
+    wilson,
+)
 from softgm_bench.analysis.runs import Evaluation, Problem, Run
-from softgm_bench.analysis.statistics import Bootstrap
+from softgm_bench.analysis.statistics import Bootstrap, mean
 
 Row = list[Cell | str]  # a plain cell may be its text
+SIGNIFICANT = "*"
 NOT_RUN, NOT_RECORDED, ONE_SEED, DASH = (Cell(text, muted=True) for text in ("not run", "not recorded", "1 seed", "—"))
 
 
@@ -43,8 +54,10 @@ BESIDE_THE_PAPER = [
 ]
 
 
-def _beside_the_paper(pool: Pool | None, theirs: paper.Row | None, bootstrap: Bootstrap, best: bool = False) -> Row:
-    row = _success(pool, bootstrap, best)
+def _beside_the_paper(
+    pool: Pool | None, theirs: paper.Row | None, bootstrap: Bootstrap, best: bool = False, mark: str = ""
+) -> Row:
+    row = _success(pool, bootstrap, best, mark)
     row.append(Cell(f"{theirs.success_rate:.2f}", muted=True) if theirs else "")
     for _, column, digits, attribute, their_digits in MEASURES:
         values = getattr(theirs, attribute) if theirs else None
@@ -53,14 +66,14 @@ def _beside_the_paper(pool: Pool | None, theirs: paper.Row | None, bootstrap: Bo
     return [*row, _spread(pool, "torque_per_agent", 2)]
 
 
-def _success(pool: Pool | None, bootstrap: Bootstrap, best: bool = False) -> Row:
+def _success(pool: Pool | None, bootstrap: Bootstrap, best: bool = False, mark: str = "") -> Row:
     if pool is None:
         return [NOT_RUN, ""]
     rates, interval = pool.success_rates, pool.success_interval(bootstrap)
     if rates is None or interval is None:
         return [NOT_RECORDED, ""]
     bounds = names.percent_interval(interval) + (" (1 seed)" if pool.seeds == 1 else "")
-    return [Cell(names.percent(rates.mean()), strong=best), bounds]
+    return [Cell(names.percent(rates.mean()) + mark, strong=best), bounds]
 
 
 def _spread(pool: Pool | None, column: str, digits: int) -> Cell | str:
@@ -73,12 +86,14 @@ def _spread(pool: Pool | None, column: str, digits: int) -> Cell | str:
 def table_one(task: str, pools: Pools, labels: Sequence[str], bootstrap: Bootstrap) -> Table:
     """Put the paper's Table I of one task beside ours, and other algorithms that were run on it below."""
     ranks = _success_ranks(task, pools, labels)
-    columns = [*_texts("Algorithm"), *_numbers("seeds × episodes", "rank"), *BESIDE_THE_PAPER]
+    columns = [*_texts("Algorithm", "recipe"), *_numbers("frames, M", "minutes", "seeds × episodes", "rank")]
+    columns += BESIDE_THE_PAPER
     rows: list[Row] = []
     for label in labels:
         pool, rank = pools.get((task, label)), ranks.get(label)
-        results = _beside_the_paper(pool, paper.table_one(task, label), bootstrap, best=rank == 1)
-        rows.append([_name(label, pool), _size(pool), _rank(pool, rank), *results])
+        mark = SIGNIFICANT if _differs(pool, pools.get((task, "softgm")), bootstrap) else ""
+        results = _beside_the_paper(pool, paper.table_one(task, label), bootstrap, rank == 1, mark)
+        rows.append([_name(label, pool), *_budget(pool), _size(pool), _rank(pool, rank), *results])
     number = f"Table I, {names.task(task)}."
     if task not in paper.TASKS:
         number = f"{names.task(task)} (not in the paper)."
@@ -86,25 +101,65 @@ def table_one(task: str, pools: Pools, labels: Sequence[str], bootstrap: Bootstr
         columns = [column for column in columns if column.name != "paper"]
     there = [pools[task, label] for label in labels if (task, label) in pools]
     caption = f"{number} Mean ± standard deviation over seeds × episodes. {_protocol(there)}"
-    return _table(f"one-{task}", caption, columns, rows, _notes(there))
+    return _table(f"one-{task}", caption, columns, rows, [*_comparability(there), *_notes(there)])
+
+
+def _budget(pool: Pool | None) -> Row:
+    """Recipe, frames and minutes of the trainings."""
+    if pool is None:
+        return ["", "", ""]
+    return [pool.recipe, names.span(pool.frames, 1e6, 2), names.span([round(minutes) for minutes in pool.minutes])]
 
 
 def _success_ranks(task: str, pools: Pools, labels: Sequence[str]) -> dict[str, int]:
-    """Rank by success rate of those that compete, if there are two or more; equal rates share a rank."""
+    """Rank by success rate of those that compete, if two or more are ``comparable``; equal rates share a rank."""
     ranked = {label: pools[task, label] for label in labels if (task, label) in pools and pools[task, label].ranked}
-    rates = {label: pool.success_rates.mean() for label, pool in ranked.items() if pool.success_rates is not None}
-    if len(rates) < 2:
+    rates = {
+        label: pool.success_rates.mean()
+        for label, pool in ranked.items()
+        if pool.success_rates is not None and pool.seeds >= SEEDS
+    }
+    if len(rates) < 2 or not equal_frames([ranked[label] for label in rates]):
         return {}
     ranks = rankdata([-rate for rate in rates.values()], method="min")
     return dict(zip(rates, map(int, ranks), strict=True))
 
 
 def _rank(pool: Pool | None, rank: int | None) -> Cell | str:
+    """The rank, or what is missing for one."""
     if pool is None:
         return ""
-    if rank is None:
-        return DASH if pool.ranked else Cell("not ranked", muted=True)
-    return str(rank)
+    if rank is not None:
+        return str(rank)
+    if not pool.ranked:
+        return Cell("not ranked", muted=True)
+    return Cell(f"{pool.seeds} of {SEEDS} seeds", muted=True) if pool.seeds < SEEDS else DASH
+
+
+def _differs(pool: Pool | None, full: Pool | None, bootstrap: Bootstrap) -> bool:
+    """Tell whether the interval over seeds of the difference of an algorithm's success to SoftGM's leaves out 0."""
+    if pool is None or full is None or pool is full or not comparable(pool, full):
+        return False
+    ours, theirs = pool.success_rates, full.success_rates
+    if ours is None or theirs is None:
+        return False
+    key = f"difference/{pool.evaluations[0].task}/{pool.label}"
+    low, high = bootstrap.interval(key, lambda first, second: mean(first) - mean(second), [ours], [theirs])
+    return bool(low > 0.0 or high < 0.0)
+
+
+def _comparability(pools: Sequence[Pool]) -> list[str]:
+    """Say what ranks and marks need, and what is missing for them."""
+    ranked = [pool for pool in pools if pool.ranked]
+    enough = [pool for pool in ranked if pool.seeds >= SEEDS]
+    notes = []
+    if ranked and (len(enough) < len(ranked) or not equal_frames(enough)):
+        why = f"Ranked are algorithms with {SEEDS} seeds or more if all of these had equal frames"
+        have = f"{len(enough)} of {len(ranked)} have the seeds"
+        notes.append(f"{why}: {have}{'' if equal_frames(enough) else ', with unequal frames'}.")
+    if any(pool.label == "softgm" for pool in enough) and len(enough) > 1:
+        notes.append(f"{SIGNIFICANT} the 95 % interval over seeds of the difference to SoftGM leaves out 0.")
+    return notes
 
 
 def success_by_step(pools: Pools) -> Table:

@@ -49,12 +49,14 @@ def same(folder: Path, trained: TrainedPolicy, episodes: int, settings: Mapping[
     """Read the summary of an evaluation of the same policy with the same settings, if ``folder`` holds it.
 
     Threads may differ, which changes no more than rounding. An evaluation that does not tell its policy's parameters,
-    of an earlier version, is none. One that does not tell its backend had the one that its settings mean.
+    of an earlier version, is none. One that does not tell its backend had the one that its settings mean; one that
+    does not tell its policy's recipe is known by the parameters.
     """
     try:
         held = json.loads(RunFolder(folder).summary.read_text())
         wanted = json.loads(to_json(_about(trained, settings)))
-        known = {key: held.get(key) for key in wanted} | {"backend": held.get("backend", wanted["backend"])}
+        untold = {key: held.get(key, wanted[key]) for key in ("backend", "recipe")}
+        known = {key: held.get(key) for key in wanted} | untold
         alike = known | {"threads": None} == wanted | {"threads": None} and held["metrics"]["episodes"] == episodes
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
@@ -90,6 +92,7 @@ def _about(trained: TrainedPolicy, settings: Mapping[str, Any]) -> dict[str, Any
         "algo": trained.label,
         "model": plain(run)["model"]["name"],
         "observation": run.observation,
+        "recipe": run.recipe,
         "seed": run.seed,
         "frames": trained.frames,
         "policy": policy.fingerprint(trained),
