@@ -137,7 +137,7 @@ def page(text: str) -> str:
 def main() -> None:
     """Rewrite them."""
     PAGE.write_text(page(PAGE.read_text()))
-    print(f"written: {PAGE.relative_to(ROOT)}; {_there([cell for grid in GRIDS for cell in cells(grid)])} cells there")
+    print(f"written: {PAGE.relative_to(ROOT)}, with {len(runs())} finished cells")
 
 
 if __name__ == "__main__":

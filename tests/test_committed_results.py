@@ -119,6 +119,7 @@ def test_a_kept_policy_belongs_to_a_committed_run(path, results):
     [
         ("trials/wall/envs-128_promote-0.5_entropy-0.003/policy-2400000", 2_400_000, "gamma 0.95"),
         ("campaign/wall/softgm/seed0/evaluations", 3_001_600, "gamma 0.98"),
+        ("campaign/wall_touch/softgm/seed0/evaluations", 3_001_600, "`wall_touch`"),
     ],
 )
 def test_a_kept_policy_is_that_of_its_evaluations_and_the_page_says_what_they_hold(results, evaluations, frames, name):
