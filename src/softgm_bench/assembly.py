@@ -1,16 +1,21 @@
 """From settings to the things that they mean: environments, policies, algorithms; and whether these can be built."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+import torch
 from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
 
 from softgm_bench import algorithms
 from softgm_bench.algorithms import Algorithm
 from softgm_bench.config import Config, compose, validate
-from softgm_bench.envs import Sizes, entries, kind_of
+from softgm_bench.config.schema import GRAPHS
+from softgm_bench.envs import SectionMixture, Sizes, entries, kind_of
 from softgm_bench.envs.interface import VECTOR
 from softgm_bench.envs.remembering import RememberingEnv
+from softgm_bench.envs.section_mixture import members, refuse_mixture, shares
 from softgm_bench.errors import UserError
 from softgm_bench.models import build_encoder
 
@@ -48,8 +53,31 @@ def build_env(config: Config, num_envs: int, seed: int, horizon: int | None = No
         seed: of everything that the environments draw.
         horizon: control steps of an episode; None: the task's own.
         training: staggered clocks and, if it is enabled, the curriculum.
+
+    Raises:
+        UserError: the task has several numbers of sections.
     """
+    refuse_mixture(config.task)
     return kind_of(config.task).build(config, num_envs, seed, horizon, training)
+
+
+def build_envs(
+    config: Config, num_envs: int, seed: int, horizon: int | None = None, training: bool = False
+) -> EnvBase | SectionMixture:
+    """``build_env``, or of several numbers of sections as many environments each as can be, ``num_envs`` in all.
+
+    In training no two of them draw the same scenes; otherwise all draw from ``seed``.
+    """
+    of_number = members(config)
+    if not of_number:
+        return build_env(config, num_envs, seed, horizon, training)
+    seeds = [seed] * len(of_number)
+    if training:
+        seeds[1:] = np.random.SeedSequence(seed).generate_state(len(of_number) - 1).tolist()
+    each = zip(of_number.items(), shares(num_envs, len(of_number)), seeds, strict=True)
+    return SectionMixture(
+        {number: build_env(one, count, own, horizon, training) for (number, one), count, own in each if count}
+    )
 
 
 def build_policy(config: Config, sizes: Sizes, frames: int = 0) -> TensorDictModuleBase:
@@ -75,6 +103,40 @@ def check_by_building(config: Config) -> None:
     Raises:
         UserError: with one line naming the key, its value and what would be right.
     """
+    of_number = members(config)
+    for one in of_number.values() or [config]:
+        _check_one(one)
+    if of_number:
+        _check_mixture(config, of_number)
+
+
+def _check_mixture(config: Config, of_number: Mapping[int, Config]) -> None:
+    """Refuse a mixture that the algorithm, its networks or the run cannot have.
+
+    Raises:
+        UserError: with one line naming the key, its value and what would be right.
+    """
+    given = f"task.n_agents={list(of_number)}"
+    advice = "give task.n_agents one number, or choose algo=softgm or ippo"
+    if not algorithms.learns_mixtures(config.algo):
+        raise UserError(f"{given}: algo={config.algo.name} learns from arms of one number of sections; {advice}")
+    if config.experiment.num_envs < len(of_number):
+        raise UserError(f"experiment.num_envs={config.experiment.num_envs} with {given}: at least one for each number")
+    if config.compile == GRAPHS:
+        raise UserError(f"compile={GRAPHS} with {given}: a mixture is not recorded; choose none or null")
+    shapes: list[dict[str, torch.Size]] = []
+    for one in of_number.values():
+        learner = build_algorithm(one, build_env(one, 1, config.seed))
+        shapes.append({name: value.shape for name, value in algorithms.named_parameters(learner)})
+    other = next((name for one in shapes for name in one if one[name] != shapes[0].get(name)), None)
+    if other is not None:
+        raise UserError(
+            f"{given}: {other} of algo={config.algo.name} has another shape for each number of sections; "
+            "give algo.critic.pooling=mean, or task.n_agents one number"
+        )
+
+
+def _check_one(config: Config) -> None:
     kind = kind_of(config.task)
     try:
         kind.check(config)

@@ -21,7 +21,8 @@ SOURCE is a run folder (its newest checkpoint), a checkpoint or a policy's file.
 Any other setting changes what the policy acts in:
 
   task=wall                      any task of conf/task, also one that it was not trained on
-  task.n_agents=8                any single setting of the task; rod.<key> and dtype likewise
+  task.n_agents=8                any single setting of the task; rod.<key> and dtype likewise. A list, [4,6,8], shares
+                                 the episodes among arms of these numbers of sections
   backend=pyelastica             PyElastica itself moves the arm: slow, float64 alone, pip install '.[pyelastica]';
                                  numba, torch (CPU), cuda and torch (GPU) are the same arm's implementations of ours
   perturbation=noise             none, noise, section_failure or disturbance (conf/perturbation)
@@ -119,7 +120,8 @@ def _play(options: Options, trained: "TrainedPolicy") -> "EpisodeRecords":
     from softgm_bench.episodes.evaluation import watched
 
     parts = math.ceil(options.episodes / (options.batch or options.episodes))
-    steps = parts * (options.horizon or trained.config.task.horizon)
+    numbers = len(trained.config.task.n_agents) if trained.config.mixed else 1
+    steps = parts * numbers * (options.horizon or trained.config.task.horizon)
     with Progress("evaluating", steps, "steps", at_most=True) as progress:
         return options.play(trained, watched(options.episodes, progress.advance))
 

@@ -41,6 +41,12 @@ def test_a_value_depends_on_whether_the_task_hides_something():
     assert resolved("${if_hidden:1, 2}", task={"name": "mine"}) == 2
 
 
+def test_a_value_depends_on_whether_numbers_of_sections_are_mixed():
+    assert resolved("${if_mixture:1, 2}", task={"n_agents": [4]}) == 1
+    assert resolved("${if_mixture:1, 2}", task={"n_agents": 4}) == 2
+    assert resolved("${if_mixture:1, 2}", task={"scenario": {"n_agents": 4}}) == 2
+
+
 def test_a_value_depends_on_whether_the_experiment_is_a_smoke_run():
     assert resolved("${in_smoke:1, 2}", experiment={"name": "smoke"}) == 1
     assert resolved("${in_smoke:1, 2}", experiment={"total_frames": 7}) == 2

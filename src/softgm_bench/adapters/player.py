@@ -13,6 +13,7 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from softgm_bench.envs import entries, kind_of
+from softgm_bench.envs.section_mixture import refuse_mixture
 from softgm_bench.episodes import policy
 from softgm_bench.episodes.policy import TrainedPolicy
 from softgm_bench.errors import UserError
@@ -51,6 +52,7 @@ class Player:
         if not shown.issuperset(self.trained.policy.in_keys):
             raise UserError(f"{self.trained.label} on {self.trained.config.task.name}: it reads what no adapter shows")
         task = self.trained.config.task
+        refuse_mixture(task)
         self._sizes = kind_of(task).sizes(task)
         self._exploration = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
         self.begin()

@@ -10,6 +10,8 @@ from softgm_bench.algorithms.registry import (
     algorithm_configs,
     build_algorithm,
     build_policy,
+    learns_mixtures,
+    named_parameters,
     register_algorithm,
 )
 from softgm_bench.algorithms.sac import SAC, SACConfig
@@ -28,5 +30,7 @@ __all__ = [
     "algorithm_configs",
     "build_algorithm",
     "build_policy",
+    "learns_mixtures",
+    "named_parameters",
     "register_algorithm",
 ]

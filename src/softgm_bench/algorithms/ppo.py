@@ -4,6 +4,7 @@ SoftGM and MAPPO have a centralised critic, one value of the state; IPPO an inde
 that agent observes. Actors and, in IPPO, critics share their parameters among agents.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +15,7 @@ from torch import Tensor
 from torchrl.modules.value_norm import PopArtValueNorm
 from torchrl.objectives.value import GAE
 
+from softgm_bench.algorithms.groups import joined, minibatches, standardised, weighted_mean
 from softgm_bench.algorithms.registry import register_algorithm
 from softgm_bench.algorithms.team import give_to_agents
 from softgm_bench.envs import entries
@@ -172,18 +174,37 @@ class PPO:
             rates that the next update begins with; how saturated the actor's head is. Without an entropy bonus, entropy
             is that of the frames' actions.
         """
-        frames = self.prepare(batch)
+        return self.update_mixture((batch,))
+
+    def update_mixture(self, batches: Sequence[TensorDictBase]) -> dict[str, float]:
+        """Improve actor and critic on fresh frames of arms with several numbers of sections.
+
+        Every frame weighs the same, whatever its number of agents: the loss of a minibatch is the mean of the groups'
+        losses by their frames, each a mean over its frames and agents. Advantages and value targets are normalised over
+        the frames of all groups.
+
+        Args:
+            batches: one for each number, ``(num_envs, steps)`` consecutive frames of the current policy each.
+
+        Returns:
+            As ``update``, over the frames of all groups.
+        """
+        groups = self._prepared(batches)
         # results are first looked at here: a GPU works through all minibatches without being waited for
-        read = torch.stack([self._epoch(frames) for _ in range(self.config.epochs)]).tolist()
+        read = torch.stack([self._epoch(groups) for _ in range(self.config.epochs)]).tolist()
         epochs = [dict(zip(self._names, values, strict=True)) for values in read]
-        self.trained_frames += batch.numel()
+        frames = [batch.numel() for batch in batches]
+        self.trained_frames += sum(frames)
         self._adapt(epochs[-1]["kl_approx"])
         self._set_learning_rates()
         means = {name: sum(epoch[name] for epoch in epochs) / len(epochs) for name in self._names}
         if not self.loss.entropy_bonus:
-            means |= {"loss_entropy": 0.0, "entropy": -batch.get(entries.LOG_PROB).mean().item()}
+            entropies = [-batch.get(entries.LOG_PROB).mean().item() for batch in batches]
+            means |= {"loss_entropy": 0.0, "entropy": weighted_mean(entropies, frames)}
         rates = dict(zip(("actor_lr", "critic_lr"), self._learning_rates, strict=True))
-        return means | rates | actor_saturation(self.policy, batch)
+        saturations = [actor_saturation(self.policy, batch) for batch in batches]
+        saturation = {name: weighted_mean([one[name] for one in saturations], frames) for name in saturations[0]}
+        return means | rates | saturation
 
     def prepare(self, batch: TensorDictBase) -> TensorDictBase:
         """Estimate advantages and value targets, and flatten to frames ``(num_envs * steps,)``.
@@ -191,27 +212,42 @@ class PPO:
         Advantages are every agent's, ``(frames, N, 1)``. Value targets have the shape of the critic's values, and with
         value normalisation their scale. An actor with memory needs frames in their order: nothing is flattened then.
         """
-        n_agents = batch.get(entries.LOG_PROB).shape[-1]
-        frames = self._estimate(batch, n_agents).select(*self._trained_on)
+        (frames,) = self._prepared((batch,))
+        return frames
+
+    def _prepared(self, batches: Sequence[TensorDictBase]) -> list[TensorDictBase]:
+        """``prepare`` each batch, with advantages and value targets in scales that all batches share."""
+        groups = [self._estimate(batch).select(*self._trained_on) for batch in batches]
+        if self.value_norm is not None:
+            self.value_norm.update(joined([frames.get(VALUE_TARGET) for frames in groups]))
+            for frames in groups:
+                frames.set(VALUE_TARGET, self.value_norm.normalize(frames.get(VALUE_TARGET)))
         if not self._in_sequences:
-            frames = frames.reshape(-1)
-        advantage = frames.get(ADVANTAGE)
-        if self.config.normalize_advantage:
-            advantage = _standardised(advantage)
-        if self.config.advantage_clip is not None:
+            groups = [frames.reshape(-1) for frames in groups]
+        for frames, advantage in zip(groups, self._scaled([frames.get(ADVANTAGE) for frames in groups]), strict=True):
+            n_agents = frames.get(entries.LOG_PROB).shape[-1]
+            frames.set(ADVANTAGE, give_to_agents(advantage, n_agents) if self.config.centralised else advantage)
+        return groups
+
+    def _scaled(self, advantages: list[Tensor]) -> list[Tensor]:
+        """Normalise and cut the advantages of all batches together, as the settings say."""
+        limit, normalised = self.config.advantage_clip, self.config.normalize_advantage
+        if normalised:
+            advantages = standardised(advantages)
+        if limit is not None:
             # a few successes among thousands of frames would otherwise leave nothing of all the other frames' say
-            limit = self.config.advantage_clip
-            advantage = advantage.clamp(-limit, limit)
-            if self.config.normalize_advantage:
-                advantage = _standardised(advantage)
-        return frames.set(ADVANTAGE, give_to_agents(advantage, n_agents) if self.config.centralised else advantage)
+            advantages = [advantage.clamp(-limit, limit) for advantage in advantages]
+            if normalised:
+                advantages = standardised(advantages)
+        return advantages
 
     @torch.no_grad()
-    def _estimate(self, batch: TensorDictBase, n_agents: int) -> TensorDictBase:
+    def _estimate(self, batch: TensorDictBase) -> TensorDictBase:
         """Add ``ADVANTAGE`` and ``VALUE_TARGET`` to a copy of the batch, of the team or (independent) of each agent."""
         after = batch.get("next")
         outcome = after.select(entries.REWARD, entries.DONE, entries.TERMINATED)
         if not self.config.centralised:
+            n_agents = batch.get(entries.LOG_PROB).shape[-1]
             outcome = outcome.apply(lambda of_team: give_to_agents(of_team, n_agents))
         estimates = self.advantage(
             TensorDict(
@@ -219,11 +255,7 @@ class PPO:
                 batch.batch_size,
             )
         )
-        target = estimates.get(VALUE_TARGET)
-        if self.value_norm is not None:
-            self.value_norm.update(target)
-            target = self.value_norm.normalize(target)
-        return batch.copy().set(ADVANTAGE, estimates.get(ADVANTAGE)).set(VALUE_TARGET, target)
+        return batch.copy().update(estimates.select(ADVANTAGE, VALUE_TARGET))
 
     def _values(self, td: TensorDictBase) -> Tensor:
         """The critic's values in the reward's scale."""
@@ -235,16 +267,15 @@ class PPO:
         """Of the metrics of a gradient step."""
         return [*REPORTED, *(ENTROPY if self.loss.entropy_bonus else ()), "actor_grad_norm", "critic_grad_norm"]
 
-    def _epoch(self, frames: TensorDictBase) -> Tensor:
+    def _epoch(self, groups: Sequence[TensorDictBase]) -> Tensor:
         """Pass once over all frames in random minibatches; means over the minibatches, in the order of ``_names``."""
         size = self.config.minibatch_size
         if self._in_sequences:
-            size = max(1, round(size / frames.shape[1]))
-        shuffled = frames[torch.randperm(len(frames), device=frames.device)]
-        # a rest much smaller than a minibatch would weigh its few frames too much
-        minibatches = [chosen for chosen in shuffled.split(size) if 2 * len(chosen) >= min(size, len(frames))]
+            size = max(1, round(size / groups[0].shape[1]))
+        if len(groups) > 1:
+            return torch.stack([self._descend(self._losses(parts)) for parts in minibatches(groups, size)]).mean(0)
         step = self._recorded or self._step
-        return torch.stack([step(minibatch) for minibatch in minibatches]).mean(0)
+        return torch.stack([step(minibatch) for (minibatch,) in minibatches(groups, size)]).mean(0)
 
     def _adapt(self, kl: float) -> None:
         """Scale the actor's learning rate so that the policy's change per update stays near ``target_kl``.
@@ -273,7 +304,19 @@ class PPO:
 
     def _step(self, minibatch: TensorDictBase) -> Tensor:
         """One gradient step of actor and critic; metrics in the order of ``_names``."""
-        losses = self.loss(minibatch)
+        return self._descend(self.loss(minibatch))
+
+    def _losses(self, parts: Sequence[TensorDictBase]) -> dict[str, Tensor]:
+        """What the loss gives of a minibatch, the mean of the groups' by their frames."""
+        frames = sum(map(len, parts))
+        means: dict[str, Tensor] = {}
+        for part in parts:
+            share = len(part) / frames
+            for name, value in self.loss(part).items():
+                means[name] = value * share if name not in means else means[name] + value * share
+        return means
+
+    def _descend(self, losses: Mapping[str, Tensor] | TensorDictBase) -> Tensor:
         total = sum(value for name, value in losses.items() if name.startswith("loss_"))
         self.actor_optimizer.zero_grad(set_to_none=True)
         self.critic_optimizer.zero_grad(set_to_none=True)
@@ -307,7 +350,3 @@ class PPO:
         self.trained_frames, self._kl_scale = state["trained_frames"], state["kl_scale"]
         if self._recorded is not None:  # the optimisers' tensors are others now
             self.use_graphs()
-
-
-def _standardised(values: Tensor) -> Tensor:
-    return (values - values.mean()) / (values.std() + 1e-8)

@@ -1,10 +1,11 @@
 """The table of algorithms, filled by ``register_algorithm``: which one a configuration means."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, Protocol, TypeVar
 
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
 
 from softgm_bench.envs.interface import Environment, Sizes
 from softgm_bench.upstream import default_dtype
@@ -14,6 +15,8 @@ class Algorithm(Protocol):
     """The interface of an algorithm for the loop of a run.
 
     One that also has ``use_graphs()`` is asked to record its gradient steps as CUDA graphs where the settings say so.
+    One that also has ``update_mixture(batches)`` can learn from arms of several numbers of sections, from a batch of
+    each at once; its parameters must not depend on that number.
 
     Attributes:
         policy: reads ``entries.OBSERVATION`` (and ``entries.PRIVILEGED`` as an oracle), writes ``entries.ACTION``;
@@ -99,6 +102,23 @@ def build_policy(
     """
     with default_dtype.float32():
         return _class_of(config).build_policy(config, model_config, sizes, oracle, frames)
+
+
+def learns_mixtures(config: Any) -> bool:
+    """Tell whether the algorithm that ``config.name`` means can learn from several numbers of sections at once."""
+    return hasattr(_class_of(config), "update_mixture")
+
+
+def named_parameters(algorithm: Algorithm) -> Iterator[tuple[str, Tensor]]:
+    """Give the parameters of every network that an algorithm holds, each once, the policy's first."""
+    modules = {"policy": algorithm.policy, **vars(algorithm)}
+    seen: set[int] = set()
+    for holder, module in modules.items():
+        if isinstance(module, nn.Module):
+            for name, parameter in module.named_parameters():
+                if id(parameter) not in seen:
+                    seen.add(id(parameter))
+                    yield f"{holder}.{name}", parameter
 
 
 def _class_of(config: Any) -> Any:

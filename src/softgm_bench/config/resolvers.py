@@ -34,6 +34,11 @@ def if_hidden(hidden: Any, plain: Any, *, _root_: DictConfig) -> Any:
     return _node(hidden if OmegaConf.select(_root_, "task.hidden_scene") else plain)
 
 
+def if_mixture(mixture: Any, one: Any, *, _root_: DictConfig) -> Any:
+    """The first value where ``task.n_agents`` is a list of numbers, the second where it is a number."""
+    return _node(mixture if OmegaConf.is_list(OmegaConf.select(_root_, "task.n_agents")) else one)
+
+
 def in_smoke(smoke: Any, otherwise: Any, *, _root_: DictConfig) -> Any:
     """The first value with ``experiment=smoke``, the second with every other experiment."""
     return _node(smoke if OmegaConf.select(_root_, "experiment.name") == SMOKE else otherwise)
@@ -62,5 +67,6 @@ def _node(value: Any) -> Any:
 
 def register() -> None:
     """Let YAML call the functions above by their names."""
-    for resolver in (tuned_or_paper, on_or_off_policy, if_centralised, if_hidden, in_smoke, in_gpu, first, label):
+    choices = (tuned_or_paper, on_or_off_policy, if_centralised, if_hidden, if_mixture, in_smoke, in_gpu)
+    for resolver in (*choices, first, label):
         OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)

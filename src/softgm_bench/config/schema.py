@@ -86,9 +86,14 @@ class Config:
         return self.observation == "oracle"
 
     @property
+    def mixed(self) -> bool:
+        """Tell whether arms of several numbers of sections are side by side (``envs.section_mixture``)."""
+        return isinstance(getattr(self.task, "n_agents", None), list)
+
+    @property
     def graphs(self) -> bool:
-        """Tell whether what a run repeats is recorded as CUDA graphs."""
-        return (self.compile or (NO_GRAPHS if self.device == "cpu" else GRAPHS)) == GRAPHS
+        """Tell whether what a run repeats is recorded as CUDA graphs; a mixture's batches are not."""
+        return (self.compile or (NO_GRAPHS if self.device == "cpu" or self.mixed else GRAPHS)) == GRAPHS
 
     @property
     def label(self) -> str:

@@ -13,6 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 from softgm_bench.assembly import configure
 from softgm_bench.config import Config, plain, validate_device
 from softgm_bench.envs import entries, kind_of
+from softgm_bench.envs.section_mixture import refuse_mixture
 from softgm_bench.episodes import policy
 from softgm_bench.errors import UserError
 
@@ -80,6 +81,7 @@ def load(
     for source, other in trained.items():
         if (differs := _difference(config, other.config)) is not None:
             raise UserError(f"{source} acts in another {differs} than {named}: add {differs}=NAME for both")
+    refuse_mixture(config.task)
     sizes = kind_of(config.task).sizes(config.task)
     counts = _apportioned(shares, transitions)
     if 0 in counts:

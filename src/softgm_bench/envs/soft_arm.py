@@ -11,6 +11,7 @@ from softgm_bench.envs import entries
 from softgm_bench.envs.interface import Sizes
 from softgm_bench.envs.perturbation import PerturbationConfig
 from softgm_bench.envs.remembering import RememberingEnv
+from softgm_bench.envs.section_mixture import numbers_of
 from softgm_bench.envs.sensing import Sight
 from softgm_bench.envs.simulation import Episodes, Simulator
 from softgm_bench.envs.specs import make_specs
@@ -23,11 +24,10 @@ from softgm_bench.upstream import graphs
 
 
 def sizes_of(task: Task) -> Sizes:
-    """Give the sizes of a task's actions and observations."""
+    """Give the sizes of a task's actions and observations; of a mixture, those of the arms with most sections."""
     n_slots = task.config.slots if task.max_cylinders else 0
-    return Sizes(
-        task.config.n_agents, DIRECTIONS, n_slots=n_slots, n_privileged=task.n_privileged, n_points=task.n_points
-    )
+    n_agents = max(numbers_of(task.config), default=task.config.n_agents)
+    return Sizes(n_agents, DIRECTIONS, n_slots=n_slots, n_privileged=task.n_privileged, n_points=task.n_points)
 
 
 class SoftArmEnv(RememberingEnv):

@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 import torch
@@ -12,13 +13,14 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
-from softgm_bench.envs import entries
+from softgm_bench.envs import SectionMixture, entries
 from softgm_bench.envs.entries import Column
 from softgm_bench.errors import NotFinite
 from softgm_bench.rod import sync
 
 DISCOUNT = 0.99  # of the returns that are reported, whatever an algorithm trains with
 FORGOTTEN = 0.1  # share of what came before that a recent mean forgets in a step
+N_AGENTS = "n_agents"  # the column of the number of sections, of a mixture of them
 CERTIFIED = "certified"  # the column of episodes whose scene is known to be solvable; see ``episodes.certified``
 CHECK_EVERY = 16  # steps between two checks whether an episode goes on, on a device that a check waits for
 
@@ -28,8 +30,8 @@ Values = NDArray[np.float64] | NDArray[np.int64] | NDArray[np.bool_]
 class EpisodeRecords(Mapping[str, Values]):
     """One number per episode in every column, ``(episodes,)``; columns are those of ``entries.EPISODE_COLUMNS``.
 
-    A column is absent where the task does not tell it; ``certified`` is there where scenes are known. Bool columns say
-    whether something ever happened in the episode.
+    A column is absent where the task does not tell it; ``certified`` is there where scenes are known, ``n_agents``
+    where arms have several numbers of sections. Bool columns say whether something ever happened in the episode.
 
     Attributes:
         horizon: most control steps of an episode; None if the environment does not say it.
@@ -38,7 +40,7 @@ class EpisodeRecords(Mapping[str, Values]):
     def __init__(self, columns: Mapping[str, Values], horizon: int | None = None) -> None:
         """Hold columns of equal lengths, in the order of the table of entries."""
         self.horizon = horizon
-        known = [*(column.name for column in entries.EPISODE_COLUMNS), CERTIFIED]
+        known = [*(column.name for column in entries.EPISODE_COLUMNS), CERTIFIED, N_AGENTS]
         self._columns = {name: columns[name] for name in known if name in columns}
 
     def __getitem__(self, name: str) -> Values:
@@ -57,6 +59,16 @@ class EpisodeRecords(Mapping[str, Values]):
         """Add the column of certified scenes, ``(episodes,)``; None: there is none to add."""
         more = {} if certified is None else {CERTIFIED: certified}
         return EpisodeRecords(self._columns | more, self.horizon)
+
+    def of_arms(self, n_agents: int) -> "EpisodeRecords":
+        """Add the column of the number of sections, the same for all."""
+        return EpisodeRecords(self._columns | {N_AGENTS: np.full(self.episodes, n_agents)}, self.horizon)
+
+    @staticmethod
+    def joined(parts: "Sequence[EpisodeRecords]") -> "EpisodeRecords":
+        """Put episodes of the same columns one after the other."""
+        columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        return EpisodeRecords(columns, parts[0].horizon)
 
     @property
     def episodes(self) -> int:
@@ -79,7 +91,7 @@ Keep = Callable[[TensorDictBase, Tensor], None]  # given every step and its "nex
 
 def evaluate(
     policy: TensorDictModuleBase,
-    env: EnvBase,
+    env: EnvBase | SectionMixture,
     *,
     deterministic: bool,
     seed: int,
@@ -91,7 +103,8 @@ def evaluate(
     """One episode in each of ``env``'s environments; the same seed gives the same episodes.
 
     ``show`` makes of a frame ``(episodes,)`` the one that the policy is shown in its place; ``watch`` follows, and
-    ``keep`` is handed every step, of which the rows count that the mask beside it names.
+    ``keep`` is handed every step, of which the rows count that the mask beside it names. Of a mixture of numbers of
+    sections one number plays after the other, each from ``seed``.
 
     Training is not disturbed: ``env`` must not be the training environment, and the global generator, on which a
     policy that samples draws, is put back.
@@ -99,6 +112,10 @@ def evaluate(
     Raises:
         NotFinite: the policy has chosen an action that is not finite.
     """
+    if isinstance(env, SectionMixture):
+        play = partial(evaluate, policy, deterministic=deterministic, seed=seed, gamma=gamma, show=show)
+        played = [play(one, watch=watch, keep=keep).of_arms(number) for number, one in env.members.items()]
+        return EpisodeRecords.joined(played)
     exploration = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
     devices = [env.device] if env.device is not None and env.device.type == "cuda" else []
     with torch.random.fork_rng(devices), torch.no_grad(), set_exploration_type(exploration):
@@ -109,7 +126,7 @@ def evaluate(
 
 def evaluate_in_parts(
     policy: TensorDictModuleBase,
-    build: Callable[[int, int], EnvBase],
+    build: Callable[[int, int], EnvBase | SectionMixture],
     episodes: int,
     *,
     deterministic: bool,
@@ -138,8 +155,7 @@ def evaluate_in_parts(
         own = evaluation_seed(seed, part)
         env = build(min(size, episodes - first), own)
         parts.append(evaluate(policy, env, deterministic=deterministic, seed=own, gamma=gamma, show=show, watch=watch))
-    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    return EpisodeRecords(columns, parts[0].horizon)
+    return EpisodeRecords.joined(parts)
 
 
 def watched(episodes: int, tell: Callable[[int, str], None]) -> Watch:

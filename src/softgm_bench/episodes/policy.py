@@ -15,6 +15,7 @@ from softgm_bench.config import Config, changed, plain, typed, validate_device
 from softgm_bench.config.checks import device_type
 from softgm_bench.config.explain import USER_ERRORS
 from softgm_bench.envs import Sizes, kind_of
+from softgm_bench.envs.section_mixture import members
 from softgm_bench.errors import UserError
 from softgm_bench.models.finite import not_finite
 from softgm_bench.rod.backend import default_backend, runs_on
@@ -155,7 +156,9 @@ def _fitted(file: Path, trained: TrainedPolicy) -> TensorDictModuleBase:
     if kind_of(config.task) is not kind_of(run.task):
         task = f"task={config.task.name}"
         raise UserError(f"{file}: it was trained on {run.task.name}, whose observations are not those of {task}")
-    check(replace(config, threads=None))  # the run's may be more than this machine has
+    here = replace(config, threads=None)  # the run's may be more than this machine has
+    for one in members(here).values() or [here]:  # arms of several numbers of sections need not learn together
+        check(one)
     sizes = kind_of(config.task).sizes(config.task)
     fitted = build_policy(config, sizes, trained.frames).to(torch.device(config.device))
     try:

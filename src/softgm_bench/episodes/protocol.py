@@ -86,14 +86,14 @@ class Protocol:
 
     def play(self, trained: TrainedPolicy, watch: Watch | None = None) -> EpisodeRecords:
         """Play the episodes in the environment that belongs to the policy; ``watch`` follows."""
-        from softgm_bench.assembly import build_env
+        from softgm_bench.assembly import build_envs
         from softgm_bench.episodes import certified
         from softgm_bench.episodes.evaluation import evaluate_in_parts
         from softgm_bench.episodes.interventions import INTERVENTIONS
 
         records = evaluate_in_parts(
             trained.policy,
-            lambda count, seed: build_env(trained.config, count, seed, self.horizon),
+            lambda count, seed: build_envs(trained.config, count, seed, self.horizon),
             self.episodes,
             deterministic=self.deterministic,
             seed=self.seed,

@@ -15,6 +15,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 from softgm_bench.assembly import build_env
 from softgm_bench.config import plain
 from softgm_bench.envs import SoftArmEnv, entries, kind_of
+from softgm_bench.envs.section_mixture import refuse_mixture
 from softgm_bench.episodes import policy, trajectory
 from softgm_bench.episodes.evaluation import act, evaluation_seed
 from softgm_bench.episodes.policy import TrainedPolicy
@@ -200,6 +201,7 @@ def _play(
 def _check(trained: TrainedPolicy, seed: int, episode: int, episodes: int, horizon: int | None) -> None:
     if not kind_of(trained.config.task).has_arm:
         raise UserError(f"task={trained.config.task.name}: it has no arm; trajectories are those of an arm")
+    refuse_mixture(trained.config.task)
     if not 0 <= seed < 2**63:
         raise UserError(f"seed={seed}: a seed is a whole number from 0 to 2**63 - 1")
     if episode < 0:

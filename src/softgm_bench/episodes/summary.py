@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softgm_bench.episodes.evaluation import CERTIFIED, EpisodeRecords
+from softgm_bench.episodes.evaluation import CERTIFIED, N_AGENTS, EpisodeRecords
 
 STEPS = (50, 100, 200, 400, 2000)  # control steps by which successes are counted, where episodes are as long
 MOTIONLESS = 1e-4  # m a control step; a tip that moves less at the end of a failed episode stands still
+BY_NUMBER = "success_rate_n"  # what begins so is the success rate of arms with the number of sections that follows
 RENAMED = {"length": "episode_length"}  # columns that summaries know by another name
 
 
@@ -18,6 +19,7 @@ def summarise(records: EpisodeRecords) -> dict[str, Any]:
     """Compute mean and standard deviation (over the episodes, population) of every column.
 
     Of what happened or did not there is the success rate with its 95 % interval, and otherwise the number of episodes.
+    Of a mixture of numbers of sections there is the same of each, as ``success_rate_n4`` with its number of episodes.
     ``success_certified`` is the rate on the scenes that are known to be solvable, with their number of episodes.
     ``success_by_step`` is the share of episodes that have succeeded by each of ``STEPS``, as far as the horizon goes.
     ``motionless_failures`` are the episodes that did not succeed and at whose end the tip moved by less than
@@ -29,7 +31,10 @@ def summarise(records: EpisodeRecords) -> dict[str, Any]:
         if name == "success":
             metrics["success_rate"] = _rate(values)
         elif name == CERTIFIED:
-            metrics["success_certified"] = _rate(records["success"][values]) | {"episodes": int(values.sum())}
+            metrics["success_certified"] = _rate_among(records, values)
+        elif name == N_AGENTS:
+            of_each = {f"{BY_NUMBER}{number}": _rate_among(records, values == number) for number in np.unique(values)}
+            metrics |= of_each if "success" in records else {}
         elif values.dtype == np.bool_:
             metrics[name] = int(values.sum())
         else:
@@ -40,6 +45,10 @@ def summarise(records: EpisodeRecords) -> dict[str, Any]:
     if "success" in records and (by_step := success_by_step(records, records.horizon)):
         metrics["success_by_step"] = by_step
     return metrics | numbers
+
+
+def _rate_among(records: EpisodeRecords, chosen: NDArray[np.bool_]) -> dict[str, float]:
+    return _rate(records["success"][chosen]) | {"episodes": int(chosen.sum())}
 
 
 def _rate(success: NDArray[Any]) -> dict[str, float]:
@@ -74,10 +83,14 @@ def table(metrics: Mapping[str, Any], title: str) -> str:
     """The metrics of ``summarise`` for a reader."""
     rows = []
     if (success := metrics.get("success_rate")) is not None:
-        rows.append(("success rate", f"{success['mean']:.3f}  [{success['low']:.3f}, {success['high']:.3f}]"))
+        rows.append(("success rate", _rate_in_words(success)))
     if (known := metrics.get("success_certified")) is not None:
-        of = f"of {known['episodes']} certified scenes"
-        rows.append(("success, certified", f"{known['mean']:.3f}  [{known['low']:.3f}, {known['high']:.3f}]  {of}"))
+        rows.append(("success, certified", f"{_rate_in_words(known)}  of {known['episodes']} certified scenes"))
+    rows += [
+        (f"success, {name.removeprefix(BY_NUMBER)} sections", _rate_in_words(value) + f"  of {value['episodes']}")
+        for name, value in metrics.items()
+        if name.startswith(BY_NUMBER)
+    ]
     rows += [(f"success by step {step}", f"{share:.3f}") for step, share in metrics.get("success_by_step", {}).items()]
     rows += [
         (name.replace("_", " "), f"{value['mean']:.3f} +- {value['std']:.3f}")
@@ -89,3 +102,7 @@ def table(metrics: Mapping[str, Any], title: str) -> str:
     width = max(len(name) for name, _ in rows)
     lines = [f"  {name:<{width}}  {value}" for name, value in rows]
     return "\n".join([title, *lines])
+
+
+def _rate_in_words(rate: Mapping[str, float]) -> str:
+    return f"{rate['mean']:.3f}  [{rate['low']:.3f}, {rate['high']:.3f}]"

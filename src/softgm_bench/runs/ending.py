@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from softgm_bench.assembly import build_env
+from softgm_bench.assembly import build_envs
 from softgm_bench.config import plain
 from softgm_bench.config.checks import device_type
 from softgm_bench.episodes.evaluation import DISCOUNT, EpisodeRecords, Watch, evaluate
@@ -28,7 +28,7 @@ TIMED_STEPS = 8  # control steps by which the final evaluation's duration is for
 def play(run: Run, episodes: int, seed: int, horizon: int | None, watch: Watch | None = None) -> EpisodeRecords:
     """Evaluate the policy while ``watch`` follows; the run's budget learns what it took."""
     began = time.perf_counter()
-    env = build_env(run.config, episodes, seed, horizon)
+    env = build_envs(run.config, episodes, seed, horizon)
     settings = run.config.experiment.evaluation
     records = evaluate(run.algorithm.policy, env, deterministic=settings.deterministic, seed=seed, watch=watch)
     # a GPU takes as long for few environments as for many, as long as launches are what takes time
@@ -100,5 +100,5 @@ def rehearse(run: Run) -> None:
 def _few_steps(run: Run, steps: int) -> EpisodeRecords:
     """Begin the final evaluation; it may have fewer steps than asked for."""
     seed, settings = run.seeds.final_evaluation, run.config.experiment.evaluation
-    env = build_env(run.config, settings.final_episodes, seed, min(steps, final_steps(run)))
+    env = build_envs(run.config, settings.final_episodes, seed, min(steps, final_steps(run)))
     return evaluate(run.algorithm.policy, env, deterministic=settings.deterministic, seed=seed)

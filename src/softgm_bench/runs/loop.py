@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,8 +12,10 @@ from tensordict import TensorDictBase
 
 from softgm_bench import output
 from softgm_bench.algorithms import Algorithm
-from softgm_bench.assembly import build_algorithm, build_env
+from softgm_bench.assembly import build_algorithm, build_envs
 from softgm_bench.config import Config, plain
+from softgm_bench.envs import SectionMixture
+from softgm_bench.envs.section_mixture import numbers_of
 from softgm_bench.episodes.evaluation import EpisodeRecords
 from softgm_bench.episodes.summary import summarise, table
 from softgm_bench.errors import NotFinite, UserError
@@ -23,13 +25,13 @@ from softgm_bench.runs.interruption import Interrupted, Interruption
 from softgm_bench.runs.loggers.guarded import Loggers, refuse_missing
 from softgm_bench.runs.loggers.video import episode_video
 from softgm_bench.runs.machine import keep_memory, set_matmul, set_threads
-from softgm_bench.runs.metrics import CsvWriter, EpisodeTracker, step_metrics
+from softgm_bench.runs.metrics import CsvWriter, EpisodeTracker, of_team, step_metrics, success_by_number
 from softgm_bench.runs.progress import Progress
 from softgm_bench.runs.run import Run, derive_seeds, frames_per_iteration, total_frames
 from softgm_bench.storage.files import to_json
 from softgm_bench.storage.run_folder import RunFolder
 from softgm_bench.upstream import default_dtype
-from softgm_bench.upstream.collector import FrameCollector, RecordingCollector
+from softgm_bench.upstream.collector import FrameCollector, MixtureCollector, RecordingCollector
 
 
 def train(config: Config) -> dict[str, Any]:
@@ -105,20 +107,28 @@ def _build(config: Config) -> Run:
     keep_memory()
     torch.manual_seed(seeds.torch)
     experiment = config.experiment
-    env = build_env(config, experiment.num_envs, seeds.training, experiment.train_horizon, training=True)
+    env = build_envs(config, experiment.num_envs, seeds.training, experiment.train_horizon, training=True)
     algorithm = build_algorithm(config, env)
     collector = _collector(config, env, algorithm)
     episodes = EpisodeTracker(experiment.num_envs, config.device)
     return Run(config, RunFolder(Path(config.run_dir)), seeds, env, algorithm, collector, episodes, started, budget)
 
 
-def _collector(config: Config, env: Any, algorithm: Algorithm) -> FrameCollector:
+def _collector(config: Config, env: Any, algorithm: Algorithm) -> FrameCollector | MixtureCollector:
     """A collector and, in ``algorithm``, gradient steps that are recorded as CUDA graphs, as far as the settings say.
 
     A policy whose exploration follows a schedule changes in other ways than a recording can see.
     """
     if config.graphs and hasattr(algorithm, "use_graphs"):
         algorithm.use_graphs()
+    if isinstance(env, SectionMixture):
+        steps = config.experiment.steps_per_batch
+        return MixtureCollector(
+            {
+                f"n{number}": FrameCollector(member, algorithm.policy, member.batch_size[0] * steps)
+                for number, member in env.members.items()
+            }
+        )
     recorded = config.graphs and hasattr(env, "in_place") and not hasattr(algorithm.policy, "schedule")
     kind = RecordingCollector if recorded else FrameCollector
     return kind(env, algorithm.policy, frames_per_iteration(config))
@@ -139,15 +149,16 @@ def _learn(run: Run, interruption: Interruption, progress: Progress) -> None:
     with CsvWriter(run.folder.metrics, append=run.iteration > 0) as metrics:
         _evaluate_if_due(run, interruption, progress)  # one that a signal interrupted before the run was resumed
         began = time.perf_counter()
-        for batch in _batches(run):
-            losses = run.algorithm.update(batch)
+        for batches in _batches(run):
+            losses = _update(run, batches)
+            frames = sum(batch.numel() for batch in batches)
             run.iteration += 1
-            run.frames += batch.numel()
-            row = _row(run, batch, losses, time.perf_counter() - began)
+            run.frames += frames
+            row = _row(run, batches, losses, time.perf_counter() - began)
             metrics.write(row)
             run.loggers.metrics(row)
-            divergence.check_update(run.algorithm, batch, losses)
-            progress.advance(batch.numel(), row.get("success_rate", math.nan))
+            divergence.check_update(run.algorithm, batches, losses)
+            progress.advance(frames, row.get("success_rate", math.nan))
             interruption.check()
             run.budget.lap()
             if run.budget.is_short(ending.final_steps(run)):
@@ -155,16 +166,25 @@ def _learn(run: Run, interruption: Interruption, progress: Progress) -> None:
                 progress.say(f"experiment.minutes={minutes}: training stops here, after {run.frames} frames")
                 return
             _evaluate_if_due(run, interruption, progress)
-            if _crossed(experiment.checkpoint.interval, run.frames, batch.numel()):
+            if _crossed(experiment.checkpoint.interval, run.frames, frames):
                 _save(run)
             began = time.perf_counter()
 
 
-def _batches(run: Run) -> Iterator[TensorDictBase]:
-    """A batch ``(num_envs, steps)`` for each iteration that is left, sampled from the current policy."""
+def _batches(run: Run) -> Iterator[Sequence[TensorDictBase]]:
+    """A batch ``(num_envs, steps)`` for each iteration that is left, sampled from the current policy.
+
+    Of a mixture one for each number of sections.
+    """
     batches = iter(run.collector)
     while run.frames < total_frames(run.config):
-        yield next(batches)
+        batch = next(batches)
+        yield batch if run.config.mixed else (batch,)
+
+
+def _update(run: Run, batches: Sequence[TensorDictBase]) -> dict[str, float]:
+    algorithm: Any = run.algorithm
+    return algorithm.update_mixture(batches) if run.config.mixed else algorithm.update(*batches)
 
 
 def _crossed(interval: int, frames: int, new_frames: int) -> bool:
@@ -172,13 +192,17 @@ def _crossed(interval: int, frames: int, new_frames: int) -> bool:
     return frames // interval > (frames - new_frames) // interval
 
 
-def _row(run: Run, batch: TensorDictBase, losses: dict[str, float], seconds: float) -> dict[str, float | int]:
+def _row(
+    run: Run, batches: Sequence[TensorDictBase], losses: dict[str, float], seconds: float
+) -> dict[str, float | int]:
+    batch = of_team(batches)
     return {
         "iteration": run.iteration,
         "frames": run.frames,
         "wall_time": run.wall_time,
         "frames_per_second": batch.numel() / seconds,
         **run.episodes.update(batch),
+        **success_by_number(batches, numbers_of(run.config.task)),
         **step_metrics(batch),
         **losses,
     }

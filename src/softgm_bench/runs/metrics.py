@@ -1,15 +1,16 @@
 """Written during training: ``metrics.csv``, one row an iteration, and the statistics of its episodes."""
 
 import csv
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 
 from softgm_bench.envs import entries
+from softgm_bench.episodes.summary import BY_NUMBER
 
 Row = Mapping[str, float | int]
 
@@ -97,6 +98,28 @@ class EpisodeTracker:
         """Resume from what ``state_dict`` returned for as many environments."""
         self._return.copy_(state["return"])
         self._length.copy_(state["length"])
+
+
+def of_team(batches: Sequence[TensorDictBase]) -> TensorDictBase:
+    """What the environments of several batches did, one after the other, but for what has a dimension of agents.
+
+    Of one batch that batch.
+    """
+    if len(batches) == 1:
+        return batches[0]
+    keys = [key for key, entry in entries.TABLE.items() if entry.shape == (1,)]
+    return torch.cat(
+        [TensorDict({"next": batch["next"].select(*keys, strict=False)}, batch.batch_size) for batch in batches]
+    )
+
+
+def success_by_number(batches: Sequence[TensorDictBase], numbers: Sequence[int]) -> dict[str, float]:
+    """Success rate of the episodes that end in each number's batch; NaN where none ends. Nothing without numbers."""
+    rates = {}
+    for number, batch in zip(numbers, batches, strict=bool(numbers)):
+        after = batch["next"]
+        rates[f"{BY_NUMBER}{number}"] = after[entries.SUCCESS][after[entries.DONE]].double().mean().item()
+    return rates
 
 
 def step_metrics(batch: TensorDictBase) -> dict[str, float]:

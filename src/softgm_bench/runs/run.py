@@ -15,7 +15,7 @@ from softgm_bench.runs.loggers.guarded import Loggers
 from softgm_bench.runs.metrics import EpisodeTracker
 from softgm_bench.storage.run_folder import RunFolder
 from softgm_bench.storage.versions import versions
-from softgm_bench.upstream.collector import FrameCollector
+from softgm_bench.upstream.collector import FrameCollector, MixtureCollector
 
 
 class Seeds(NamedTuple):
@@ -32,7 +32,7 @@ class Run:
     """A run under way.
 
     Attributes:
-        env: an ``Environment``.
+        env: an ``Environment``, of a mixture a ``SectionMixture``.
         started: when it would have begun if it had never been interrupted, on the clock of ``time.perf_counter``.
         budget: of this process's time.
         frames: control steps of single environments that the policy has learnt from.
@@ -44,7 +44,7 @@ class Run:
     seeds: Seeds
     env: Any
     algorithm: Algorithm
-    collector: FrameCollector
+    collector: FrameCollector | MixtureCollector
     episodes: EpisodeTracker
     started: float
     budget: Budget

@@ -1,6 +1,6 @@
 """Frames from the training environments, and what of their collection a checkpoint needs."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import torch
@@ -46,6 +46,32 @@ class FrameCollector(Collector):
     def show(self, frame: Mapping[str, Any]) -> None:
         """Resume from what ``shown`` returned; the environment must be put where it was then, too."""
         self._carrier.update(TensorDict(dict(frame), self._carrier.batch_size, device=self._carrier.device))
+
+
+class MixtureCollector:
+    """Collectors by name, which are asked in turn; a batch of each together is a batch of the mixture."""
+
+    def __init__(self, collectors: Mapping[str, FrameCollector]) -> None:
+        """Take collectors that nobody else asks."""
+        self._collectors = dict(collectors)
+
+    def __iter__(self) -> Iterator[tuple[TensorDictBase, ...]]:
+        """Collect without end, a batch of each collector in their order."""
+        return zip(*self._collectors.values(), strict=True)
+
+    def shown(self) -> dict[str, Any]:
+        """A copy of what policies will be shown next, by the collectors' names."""
+        return {name: collector.shown() for name, collector in self._collectors.items()}
+
+    def show(self, frames: Mapping[str, Any]) -> None:
+        """Resume from what ``shown`` returned; the environments must be put where they were then, too."""
+        for name, collector in self._collectors.items():
+            collector.show(frames[name])
+
+    def shutdown(self) -> None:
+        """Expect no more batches."""
+        for collector in self._collectors.values():
+            collector.shutdown()
 
 
 class RecordingCollector(FrameCollector):

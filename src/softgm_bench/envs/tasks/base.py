@@ -10,6 +10,7 @@ import torch
 from tensordict import TensorClass
 from torch import Tensor
 
+from softgm_bench.envs.section_mixture import check_numbers
 from softgm_bench.rod import sync
 from softgm_bench.rod.state import Cylinders
 
@@ -76,10 +77,13 @@ class CurriculumConfig:
 
 @dataclass
 class TaskConfig:
-    """Settings that every task has; values and their meaning in ``conf/task``."""
+    """Settings that every task has; values and their meaning in ``conf/task``.
+
+    ``n_agents`` is a number, or the list of those that a mixture has (``envs.section_mixture``).
+    """
 
     name: str
-    n_agents: int
+    n_agents: Any
     horizon: int
     success_radius: float
     min_dilatation: float
@@ -102,7 +106,8 @@ class TaskConfig:
         Raises:
             ValueError: with one line naming the key, its value and what would be right.
         """
-        for name, lowest in (("n_agents", 1), ("horizon", 1), ("slots", 0)):
+        check_numbers(self.n_agents)
+        for name, lowest in (("horizon", 1), ("slots", 0)):
             if getattr(self, name) < lowest:
                 raise ValueError(f"task.{name} is {getattr(self, name)}: it must be at least {lowest}")
         if self.train_horizon is not None and self.train_horizon < 1:

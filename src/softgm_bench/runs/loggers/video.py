@@ -7,6 +7,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from softgm_bench.config import Config
 from softgm_bench.envs import Sizes, kind_of
+from softgm_bench.envs.section_mixture import members
 from softgm_bench.episodes.policy import TrainedPolicy
 from softgm_bench.episodes.recording import record
 from softgm_bench.storage.versions import versions
@@ -24,6 +25,7 @@ def episode_video(config: Config, policy: TensorDictModuleBase, sizes: Sizes, fr
     from softgm_bench.render import video  # late: drawing is an extra
     from softgm_bench.render.still import PictureSettings, Studio
 
+    config = next(iter(members(config).values()), config)  # of a mixture the first
     settings = config.experiment.evaluation
     horizon = min(settings.final_horizon or config.task.horizon, LONGEST)
     trained = TrainedPolicy(policy, sizes, config, frames, versions(), config)
