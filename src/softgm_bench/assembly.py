@@ -64,9 +64,9 @@ def build_env(config: Config, num_envs: int, seed: int, horizon: int | None = No
 def build_envs(
     config: Config, num_envs: int, seed: int, horizon: int | None = None, training: bool = False
 ) -> EnvBase | SectionMixture:
-    """``build_env``, or of several numbers of sections as many environments each as can be, ``num_envs`` in all.
+    """``build_env``; or ``num_envs`` environments in all, shared out among a task's several numbers of sections.
 
-    In training no two of them draw the same scenes; otherwise all draw from ``seed``.
+    In training no two numbers draw the same scenes; otherwise all draw from ``seed``.
     """
     of_number = members(config)
     if not of_number:

@@ -6,31 +6,30 @@ from torchrl.collectors import Collector
 from torchrl.envs.utils import ExplorationType
 
 from softgm_bench.algorithms.ppo import ADVANTAGE, PPO, VALUE_TARGET
+from softgm_bench.config import compose
 from softgm_bench.envs import entries, make_env
+from softgm_bench.envs.section_mixture import members
 from softgm_bench.rod.parameters import RodParameters
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-SHORT = RodParameters(substeps=5)
+SHORT = RodParameters(n_elements=20, substeps=5)
 NO_BONUS = ("algo.entropy_coeff=0.0",)  # which is estimated by sampling
 NUMBERS = {4: 4, 6: 3, 8: 1}  # environments of each number of sections
 
 
-@pytest.fixture
-def build(settings):
-    """A learner with the same networks whatever the number of sections, and fresh batches of each number."""
+SETTINGS = ("recipe=paper", "task=structured", "algo.epochs=2", "algo.minibatch_size=16", "model.hidden=16")
 
-    def learner(number, *overrides):
-        config = settings("task=wall", f"task.n_agents={number}", "algo.epochs=2", "algo.minibatch_size=16", *overrides)
-        env = make_env(config.task, SHORT, num_envs=NUMBERS[number], seed=number, horizon=7)
+
+def build(*overrides):
+    """Learners with the same networks for each number of sections alone, and fresh batches of each."""
+    config = compose([*SETTINGS, *overrides, f"task.n_agents={list(NUMBERS)}"])
+    learners, batches = [], []
+    for number, one in members(config).items():
+        env = make_env(one.task, SHORT, num_envs=NUMBERS[number], seed=number, horizon=7)
         torch.manual_seed(0)
-        return PPO(config.algo, config.model, env), env
-
-    def all_of_them(*overrides):
-        learners = {number: learner(number, *overrides) for number in NUMBERS}
-        batches = [collect(*pair) for pair in learners.values()]
-        return [one for one, _ in learners.values()], batches
-
-    return all_of_them
+        learners.append(PPO(one.algo, one.model, env))
+        batches.append(collect(learners[-1], env))
+    return learners, batches
 
 
 def collect(algorithm, env, steps=8):
@@ -67,7 +66,7 @@ KINDS = pytest.mark.parametrize(
 
 
 @KINDS
-def test_the_gradient_is_the_mean_of_the_groups_gradients_by_their_frames(build, overrides):
+def test_the_gradient_is_the_mean_of_the_groups_gradients_by_their_frames(overrides):
     learners, batches = build(*overrides, *NO_BONUS)
     groups = learners[0]._prepared(batches)
     found = gradients(learners[0], learners[0]._losses(groups))
@@ -80,7 +79,7 @@ def test_the_gradient_is_the_mean_of_the_groups_gradients_by_their_frames(build,
 
 
 @KINDS
-def test_a_groups_gradient_does_not_depend_on_who_computes_it_nor_on_the_others(build, overrides):
+def test_a_groups_gradient_does_not_depend_on_who_computes_it_nor_on_the_others(overrides):
     """Bit by bit: by a learner of another number, alone, and beside frames of the others that say nothing."""
     learners, batches = build(*overrides, *NO_BONUS)
     groups = learners[0]._prepared(batches)
@@ -104,7 +103,7 @@ def _silent(frames, scale):
 
 
 @pytest.mark.parametrize("name", ["softgm", "ippo"])
-def test_advantages_and_targets_have_one_scale_for_all(build, name):
+def test_advantages_and_targets_have_one_scale_for_all(name):
     learners, batches = build(f"algo={name}", "algo.value_norm_decay=0.5")
     raw, *_ = build(f"algo={name}", "algo.normalize_advantage=false")[0]
     groups, plain = learners[0]._prepared(batches), raw._prepared(batches)
@@ -122,7 +121,7 @@ def test_advantages_and_targets_have_one_scale_for_all(build, name):
 
 
 @KINDS
-def test_an_update_over_one_number_is_the_plain_one_and_over_several_moves_everything(build, overrides):
+def test_an_update_over_one_number_is_the_plain_one_and_over_several_moves_everything(overrides):
     (first, second, third), batches = build(*overrides, "algo.target_kl=0.01")
     torch.manual_seed(3)
     plain = first.update(batches[0])
@@ -139,7 +138,7 @@ def test_an_update_over_one_number_is_the_plain_one_and_over_several_moves_every
     assert third.trained_frames == 8 * sum(NUMBERS.values())
 
 
-def test_what_is_told_of_an_update_is_a_mean_over_all_frames(build):
+def test_what_is_told_of_an_update_is_a_mean_over_all_frames():
     (one, *_), batches = build("algo=softgm", "algo.entropy_coeff=0.0")
     told = one.update_mixture(batches)
     everything = torch.cat([batch[entries.LOG_PROB].mean(-1).flatten() for batch in batches])

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from torchrl.envs import EnvBase
 
 from softgm_bench.assembly import build_env, build_envs, configure
+from softgm_bench.config import compose
 from softgm_bench.envs import Environment, entries, kind_of
 from softgm_bench.envs.section_mixture import members, shares
 from softgm_bench.errors import UserError
@@ -16,7 +17,7 @@ SMALL = ("task=wall", "rod.n_elements=20", "recipe=paper")
 
 
 def mixture(*overrides, num_envs=5, seed=3, training=True):
-    config = configure([*SMALL, "task.n_agents=[4,6,5]", *overrides])
+    config = compose([*SMALL, "task.n_agents=[4,6,5]", *overrides])
     return config, build_envs(config, num_envs, seed, horizon=9, training=training)
 
 

@@ -40,7 +40,7 @@ def broken(*_, **__):
         (Run, "state_dict"),
         (checkpoint, "save"),
         (checkpoint, "load"),
-        (ending, "build_env"),  # of the final evaluation
+        (ending, "build_envs"),  # of the final evaluation
         (ending, "evaluate"),
         (ending, "summarise"),
         (EpisodeRecords, "rows"),

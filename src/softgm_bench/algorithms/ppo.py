@@ -316,7 +316,8 @@ class PPO:
                 means[name] = value * share if name not in means else means[name] + value * share
         return means
 
-    def _descend(self, losses: Mapping[str, Tensor] | TensorDictBase) -> Tensor:
+    def _descend(self, losses: Mapping[str, Any] | TensorDictBase) -> Tensor:
+        """Step along what ``self.loss`` gave."""
         total = sum(value for name, value in losses.items() if name.startswith("loss_"))
         self.actor_optimizer.zero_grad(set_to_none=True)
         self.critic_optimizer.zero_grad(set_to_none=True)

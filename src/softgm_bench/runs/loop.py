@@ -176,7 +176,7 @@ def _batches(run: Run) -> Iterator[Sequence[TensorDictBase]]:
 
     Of a mixture one for each number of sections.
     """
-    batches = iter(run.collector)
+    batches: Iterator[Any] = iter(run.collector)
     while run.frames < total_frames(run.config):
         batch = next(batches)
         yield batch if run.config.mixed else (batch,)

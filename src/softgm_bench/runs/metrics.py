@@ -108,9 +108,8 @@ def of_team(batches: Sequence[TensorDictBase]) -> TensorDictBase:
     if len(batches) == 1:
         return batches[0]
     keys = [key for key, entry in entries.TABLE.items() if entry.shape == (1,)]
-    return torch.cat(
-        [TensorDict({"next": batch["next"].select(*keys, strict=False)}, batch.batch_size) for batch in batches]
-    )
+    told = [TensorDict({"next": batch["next"].select(*keys, strict=False)}, batch.batch_size) for batch in batches]
+    return TensorDict.cat(told)
 
 
 def success_by_number(batches: Sequence[TensorDictBase], numbers: Sequence[int]) -> dict[str, float]:
