@@ -47,7 +47,7 @@ def summarise(records: EpisodeRecords) -> dict[str, Any]:
     return metrics | numbers
 
 
-def _rate_among(records: EpisodeRecords, chosen: NDArray[np.bool_]) -> dict[str, Any]:
+def _rate_among(records: EpisodeRecords, chosen: NDArray[Any]) -> dict[str, Any]:
     return _rate(records["success"][chosen]) | {"episodes": int(chosen.sum())}
 
 
