@@ -261,3 +261,14 @@ def test_a_kept_policy_still_reaches_targets(algo):
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         episodes = env.rollout(100, trained.policy, break_when_any_done=False)
     assert episodes["next"][entries.SUCCESS].any(dim=1).double().mean() > 0.85
+
+
+def test_what_is_said_of_a_mixture_of_sections_is_what_was_played():
+    page = (ROOT / "docs/training.md").read_text()
+    told = {"4, 6 and 8": "sections-4-6-8", "6 alone": "sections-6"}
+    for name, folder in told.items():
+        (row,) = re.findall(rf"^\| {name} \| (.*) \|$", page, re.MULTILINE)
+        played = ROOT / "experiments/trials/basic" / folder / "evaluations/4-6-8/summary.json"
+        metrics = json.loads(played.read_text())["metrics"]
+        rates = [metrics[f"success_rate_n{number}"] for number in (4, 6, 8)]
+        assert row.split(" | ") == [f"{rate['mean']:.2f} [{rate['low']:.2f}, {rate['high']:.2f}]" for rate in rates]
