@@ -44,6 +44,8 @@ PUBLIC = {
         "rod.parameters",
         "rod.state",
         "rod.actuation",
+        "rod.bodies",
+        "rod.randomise",
         "rod.backend",
         "rod.numba_backend",
         "rod.torch_backend",

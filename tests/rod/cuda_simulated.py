@@ -4,14 +4,18 @@ The simulator has to be chosen before Numba is imported, hence a process of its 
 every thread as a Python thread: rods are short here and so are the steps.
 """
 
+from dataclasses import replace
+
 import pytest
 import torch
 from sharp_bends import beyond_polynomials
 
 from softgm_bench.envs import make_env
 from softgm_bench.rod import cuda_step
+from softgm_bench.rod.bodies import Bodies, draw
 from softgm_bench.rod.cuda_backend import CudaBackend
-from softgm_bench.rod.parameters import RodParameters
+from softgm_bench.rod.parameters import DAMPING_PROTOCOLS, RodParameters
+from softgm_bench.rod.randomise import FACTORS, RandomiseConfig
 from softgm_bench.rod.state import Cylinders, RodState, dilatation, straight_rods
 from softgm_bench.rod.torch_backend import TorchBackend
 
@@ -260,6 +264,27 @@ def test_a_control_step_is_as_many_substeps_one_after_another():
     for substeps in (1, 4, 5):
         pieces = backend.control_step(pieces, couple, substeps=substeps)
     assert_close(pieces, backend.control_step(state, couple, substeps=10))
+
+
+@pytest.mark.parametrize("protocol", DAMPING_PROTOCOLS)
+def test_each_rod_of_a_batch_may_have_a_body_of_its_own(protocol):
+    parameters, state, couple, force, cylinders = batch()
+    parameters = replace(parameters, **FRICTION, gravity=(0.5, 0.3, -9.81), damping_protocol=protocol)
+    config = RandomiseConfig("x", **dict.fromkeys(FACTORS, (0.6, 1.6)))
+    drawn = draw(config, 3, torch.Generator().manual_seed(0))
+    bodies = Bodies(*drawn[:, : len(Bodies._fields)].unbind(-1))
+    given = (state, couple, force, cylinders)
+    expected = TorchBackend(parameters).control_step(*given, bodies=bodies)
+    found = CudaBackend(parameters).control_step(*given, bodies=bodies)
+    assert largest_change(expected, TorchBackend(parameters).control_step(*given)) > 1e-3
+    assert_close(found, expected)
+    for i in range(3):
+        own = bodies.arm(parameters, i)
+        alone = CudaBackend(own).control_step(*(values[i : i + 1] for values in given))
+        assert_close(alone, found[i : i + 1])
+    single = CudaBackend(parameters).control_step(state.float(), *given[1:], bodies=bodies)
+    assert single.position.dtype == torch.float32
+    assert (single.position - expected.position).abs().max() < 1e-4
 
 
 def test_float32_stays_float32_and_follows_float64():

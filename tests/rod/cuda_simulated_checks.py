@@ -42,6 +42,14 @@ def test_nodes_touch_as_by_the_dense_test(dtype):
     assert torch.equal(found, contact_nodes_dense(position, VOLUME.to(dtype), cylinders))
 
 
+def test_nodes_touch_with_the_volumes_of_their_own_rod():
+    position, cylinders = random_scene(0, num_envs=40)
+    volume = torch.linspace(0.25, 2.0, 40, dtype=torch.float64)[:, None] * VOLUME
+    found = contact_nodes(position, volume, cylinders)
+    assert torch.equal(found, contact_nodes_dense(position, volume, cylinders))
+    assert not torch.equal(found, contact_nodes_dense(position, VOLUME, cylinders))
+
+
 def test_masked_cylinders_are_never_read_and_no_cylinders_mean_no_contact():
     position, cylinders = random_scene(3, num_envs=5)
     expected = contact_nodes(position, VOLUME, cylinders)

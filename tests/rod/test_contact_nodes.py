@@ -48,6 +48,17 @@ def random_scene(seed: int, num_envs: int = 1, n_cylinders: int = 5) -> tuple[Te
     return position, cylinders
 
 
+def test_every_rod_may_have_volumes_of_its_own():
+    position, cylinders = random_scene(1, num_envs=40)
+    volume = torch.linspace(0.25, 2.0, 40, dtype=torch.float64)[:, None] * VOLUME
+    found = contact_nodes(position, volume, cylinders)
+    assert torch.equal(found, contact_nodes_dense(position, volume, cylinders))
+    for row in range(40):
+        alone = contact_nodes(position[row : row + 1], volume[row], cylinders[row : row + 1])
+        assert torch.equal(found[row : row + 1], alone)
+    assert not torch.equal(found, contact_nodes(position, VOLUME, cylinders))
+
+
 @given(p=point, start=point, end=point)
 def test_point_segment_distance_equals_brute_force(p: tuple, start: tuple, end: tuple):
     p, start, end = tensor(p), tensor(start), tensor(end)

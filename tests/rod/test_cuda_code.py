@@ -11,6 +11,7 @@ import torch
 
 import cuda_code
 from softgm_bench.rod import cuda_backend
+from softgm_bench.rod.bodies import Bodies
 from softgm_bench.rod.cuda_step import most_registers
 from softgm_bench.rod.parameters import RodParameters
 from softgm_bench.rod.state import Cylinders, straight_rods
@@ -19,7 +20,7 @@ DTYPES = {np.float64: torch.float64, np.float32: torch.float32}
 PRECISIONS = list(DTYPES)
 
 
-def launch(n_elements: int, real: type, contact: str | None, moving: bool) -> tuple[Any, tuple]:
+def launch(n_elements: int, real: type, contact: str | None, moving: bool, drawn: bool) -> tuple[Any, tuple]:
     """The kernel that a control step launches, and its arguments."""
     parameters = RodParameters(n_elements=n_elements, contact_model=contact or "pyelastica")
     state = straight_rods(parameters, 2, DTYPES[real])
@@ -37,12 +38,13 @@ def launch(n_elements: int, real: type, contact: str | None, moving: bool) -> tu
         couple = torch.zeros(2, 3, n_elements)
         given = {"cylinders": cylinders if contact else None}
         given |= {"cylinder_velocity": torch.ones(2, 3, 3)} if moving else {}
+        given |= {"bodies": Bodies(*[torch.ones(2)] * len(Bodies._fields))} if drawn else {}
         return cuda_code.launched(cuda_backend, lambda: backend.control_step(state, couple, **given))
 
 
 @cache
-def ptx(n_elements: int, real: type, contact: str | None, moving: bool = False) -> str:
-    return cuda_code.ptx(*launch(n_elements, real, contact, moving))
+def ptx(n_elements: int, real: type, contact: str | None, moving: bool = False, drawn: bool = False) -> str:
+    return cuda_code.ptx(*launch(n_elements, real, contact, moving, drawn))
 
 
 @pytest.fixture(autouse=True)
@@ -63,6 +65,11 @@ def test_float32_code_holds_no_float64_instruction(contact: str | None):
 @pytest.mark.parametrize("contact", ["pyelastica", "exact"])
 def test_float32_code_with_cylinders_that_move_holds_no_float64_instruction(contact: str):
     assert ".f64" not in ptx(60, np.float32, contact, moving=True)
+
+
+@pytest.mark.parametrize("contact", [None, "pyelastica"])
+def test_float32_code_of_bodies_holds_no_float64_instruction(contact: str | None):
+    assert ".f64" not in ptx(60, np.float32, contact, drawn=True)
 
 
 def test_float64_code_holds_float64_instructions():

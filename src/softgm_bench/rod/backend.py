@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from softgm_bench.rod.bodies import Bodies
     from softgm_bench.rod.parameters import RodParameters
     from softgm_bench.rod.state import Cylinders, RodState
 
@@ -30,6 +31,7 @@ class Backend(Protocol):
         active: Tensor | None = None,
         substeps: int | None = None,
         cylinder_velocity: Tensor | None = None,
+        bodies: Bodies | None = None,
     ) -> RodState:
         """Advance every active rod by one control step and return a new state."""
         ...

@@ -30,7 +30,7 @@ def element_radius(position: Tensor, volume: Tensor) -> Tensor:
 
     Args:
         position: ``(num_envs, 3, n_nodes)``.
-        volume: conserved volumes of the elements, m^3, ``(n_elements,)``.
+        volume: conserved volumes of the elements, m^3, ``(n_elements,)`` or ``(num_envs, n_elements)``.
 
     Returns:
         ``(num_envs, n_elements)``.
@@ -52,6 +52,7 @@ def contact_forces(
     cylinders: Cylinders,
     parameters: RodParameters,
     cylinder_velocity: Tensor | None = None,
+    friction: Tensor | None = None,
 ) -> Tensor:
     """Return the forces of cylinders on nodes, N (PyElastica's ``_calculate_contact_forces_rod_cylinder``).
 
@@ -66,6 +67,7 @@ def contact_forces(
         cylinders: of the same ``num_envs``; values of masked ones are never read.
         parameters: stiffness, damping and friction.
         cylinder_velocity: m/s, ``(num_envs, n_cylinders, 3)``, PyElastica's ``velocity_cylinder``; None: they rest.
+        friction: the environments' coefficients of friction, ``(num_envs, 1, 1)``; None: the parameters'.
 
     Returns:
         ``(num_envs, 3, n_nodes)`` in the world frame.
@@ -84,7 +86,7 @@ def contact_forces(
     distance = safe_norm(gap)
     penetration = radius[:, None] + cylinder_radius - distance
     touching = cylinders.mask[:, :, None] & (penetration > 0.0)
-    force = _pair_forces(gap, distance, penetration, approach, touching, parameters)
+    force = _pair_forces(gap, distance, penetration, approach, touching, parameters, friction)
     # One after the other, so that a masked cylinder's zeros change no bit; sum() may group them.
     return -_elements_to_nodes(force.cumsum(1)[:, -1])
 
@@ -141,6 +143,7 @@ def _pair_forces(
     approach: Tensor,
     touching: Tensor,
     parameters: RodParameters,
+    friction: Tensor | None,
 ) -> Tensor:
     """Half the force of the rod on the cylinder for every pair, ``(num_envs, n_cylinders, 3, n_elements)``.
 
@@ -156,9 +159,9 @@ def _pair_forces(
     # Regularised Coulomb friction: viscous up to the Coulomb limit, against the slip.
     slip = approach - normal_speed.unsqueeze(-2) * normal
     slip_speed = safe_norm(slip)
-    limit = parameters.friction_coefficient * magnitude.abs()
-    friction = torch.minimum(parameters.velocity_damping_coefficient * slip_speed, limit) / (slip_speed + 1e-14)
-    return force - friction.unsqueeze(-2) * slip
+    limit = (parameters.friction_coefficient if friction is None else friction) * magnitude.abs()
+    drag = torch.minimum(parameters.velocity_damping_coefficient * slip_speed, limit) / (slip_speed + 1e-14)
+    return force - drag.unsqueeze(-2) * slip
 
 
 def _existing(cylinders: Cylinders) -> tuple[Tensor, Tensor, Tensor]:

@@ -23,7 +23,7 @@ def contact_nodes(position: Tensor, volume: Tensor, cylinders: Cylinders) -> Ten
 
     Args:
         position: ``(num_envs, 3, n_nodes)``.
-        volume: of the elements, m^3, ``(n_elements,)``.
+        volume: of the elements, m^3, ``(n_elements,)``, or of every environment's, ``(num_envs, n_elements)``.
         cylinders: of the same ``num_envs``; values of masked ones are never read.
 
     Returns:
@@ -37,6 +37,7 @@ def contact_nodes(position: Tensor, volume: Tensor, cylinders: Cylinders) -> Ten
 
         return cuda_checks.contact_nodes(position, volume, cylinders)
     touching = torch.zeros((position.shape[0], position.shape[2]), dtype=torch.bool)
+    volume = volume.reshape(-1, volume.shape[-1])
     values = (position, volume, cylinders.start, cylinders.axis, cylinders.length, cylinders.radius, cylinders.mask)
     _mark(*sync.arrays(*values, touching))
     return touching
@@ -84,7 +85,8 @@ _touches = _jit(with_callees(touches, {"product": _product, "clip": _jit(clip)})
 def _mark(position, volume, start, axis, length, radius, mask, touching):
     """Set ``touching``; a cylinder whose bounding box is apart from the rod's costs a few comparisons."""
     for b in numba.prange(position.shape[0]):
-        low, high = _box(position[b], volume)
+        own = volume[b] if volume.shape[0] > 1 else volume[0]
+        low, high = _box(position[b], own)
         node_radius = np.empty(0, position.dtype)
         for c in range(mask.shape[1]):
             if not mask[b, c]:
@@ -96,7 +98,7 @@ def _mark(position, volume, start, axis, length, radius, mask, touching):
                 apart |= max(start[b, c, i], end) + radius[b, c] < low[i]
             if not apart:
                 if node_radius.shape[0] == 0:
-                    node_radius = _node_radius(position[b], volume)
+                    node_radius = _node_radius(position[b], own)
                 _compare(position[b], node_radius, start[b, c], axis[b, c], length[b, c], radius[b, c], touching[b])
 
 

@@ -3,7 +3,8 @@
 import torch
 from torch import Tensor
 
-from softgm_bench.rod.cuda_kernel import SIMULATED, Coefficients, coefficients
+from softgm_bench.rod.bodies import Bodies, scales
+from softgm_bench.rod.cuda_kernel import SIMULATED, Coefficients, coefficients, coefficients_of
 from softgm_bench.rod.cuda_launch import REAL, launch
 from softgm_bench.rod.cuda_step import MAX_ELEMENTS, ROWS, make_step, scratch_columns
 from softgm_bench.rod.parameters import RodParameters
@@ -38,6 +39,7 @@ class CudaBackend:
         active: Tensor | None = None,
         substeps: int | None = None,
         cylinder_velocity: Tensor | None = None,
+        bodies: Bodies | None = None,
     ) -> RodState:
         """Advance every rod by one control step.
 
@@ -50,6 +52,7 @@ class CudaBackend:
             substeps: of this step, the parameters' number by default.
             cylinder_velocity: with which the cylinders move on from where they are now, m/s, without turning,
                 ``(num_envs, n_cylinders, 3)``; constant in the step. By default they stand still.
+            bodies: factors on the parameters, an arm for each environment; by default all are the nominal one.
 
         Returns:
             A new state.
@@ -58,8 +61,8 @@ class CudaBackend:
             ValueError: if the arguments' shapes do not fit together, a tensor is not where the state is, or a gradient
                 is asked for.
         """
-        check_inputs(self.parameters, state, couple, force, cylinders, active, cylinder_velocity)
-        refuse_gradients("cuda", state, couple, force)
+        check_inputs(self.parameters, state, couple, force, cylinders, active, cylinder_velocity, bodies)
+        refuse_gradients("cuda", state, couple, force, bodies)
         device, dtype = state.position.device, state.position.dtype
         _check_device(
             device,
@@ -68,6 +71,7 @@ class CudaBackend:
             active=active,
             cylinders=cylinders,
             cylinder_velocity=cylinder_velocity,
+            **({} if bodies is None else {f"bodies.{name}": factor for name, factor in bodies._asdict().items()}),
         )
         if dtype not in REAL:
             raise ValueError(f"the state is {dtype}: the cuda backend computes in float64 or float32")
@@ -91,16 +95,21 @@ class CudaBackend:
             scratch = torch.empty((len(couple), ROWS, columns), dtype=dtype, device=device) if columns else nothing
             flags = never[0] if active is None else active.bool().contiguous()
             launch(
-                make_step(self.parameters.n_elements, REAL[dtype], contact, moving),
+                make_step(self.parameters.n_elements, REAL[dtype], contact, moving, bodies is not None),
                 len(couple),
                 self.parameters.n_nodes,
                 [*old, *new, couple, force_or_nothing, flags, *obstacles, scratch],
                 int(force is not None),
                 int(active is not None),
-                self._coefficients[REAL[dtype]],
+                self._coefficients[REAL[dtype]] if bodies is None else self._rows(bodies, dtype),
                 self.parameters.substeps if substeps is None else substeps,
             )
         return RodState(*new, batch_size=state.batch_size)
+
+    def _rows(self, bodies: Bodies, dtype: torch.dtype) -> Tensor:
+        """The coefficients of every environment's body, ``(num_envs, 27)``."""
+        factors = Bodies(*(factor.detach().double() for factor in bodies))
+        return coefficients_of(self._coefficients[REAL[torch.float64]], scales(factors, self.parameters)).to(dtype)
 
 
 def _inputs(dtype: torch.dtype, *tensors: Tensor) -> list[Tensor]:

@@ -28,6 +28,7 @@ def contact_nodes(position: Tensor, volume: Tensor, cylinders: Cylinders) -> Ten
     """``contact_nodes.contact_nodes`` in one launch; arguments and result are the same."""
     num_envs, _, n_nodes = position.shape
     touching = torch.empty((num_envs, n_nodes), dtype=torch.bool, device=position.device)
+    volume = volume.reshape(-1, n_nodes - 1)
     read = (position, volume, cylinders.start, cylinders.axis, cylinders.length, cylinders.radius, cylinders.mask)
     kernel = make_contact_nodes(n_nodes, REAL[position.dtype])
     launch(kernel, num_envs, n_nodes, [*(value.contiguous() for value in read), touching])
@@ -63,7 +64,8 @@ def make_contact_nodes(n_nodes: int, real: type) -> Callable[..., Any]:
         b, k = cuda.blockIdx.x, cuda.threadIdx.x
         x, y, z = position[b, 0, k], position[b, 1, k], position[b, 2, k]
         left, right = larger(k - 1, 0), smaller(k, n - 1)
-        own = product(half, radius_at(position[b], volume, left) + radius_at(position[b], volume, right))
+        filled = volume[b] if volume.shape[0] > 1 else volume[0]
+        own = product(half, radius_at(position[b], filled, left) + radius_at(position[b], filled, right))
         found = False
         for c in range(mask.shape[1]):
             if mask[b, c]:

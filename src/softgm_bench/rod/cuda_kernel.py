@@ -13,8 +13,11 @@ from math import asin, exp, sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from numba import config, cuda
+from torch import Tensor
 
+from softgm_bench.rod.bodies import Scales
 from softgm_bench.rod.callees import with_callees
 from softgm_bench.rod.parameters import RodParameters, rod_constants
 from softgm_bench.rod.series import SMALL_BEND, SMALL_EXPONENT, SMALL_TURN, TINY, bend, cosc, exponential, sinc
@@ -104,6 +107,73 @@ def coefficients(parameters: RodParameters, real: type) -> Coefficients:
         slip_damping=contact.slip_damping,
     )
     return Coefficients(*(real(value) for value in values))
+
+
+# The scale of every coefficient that depends on the body, or over which it stands; the decays have it as their power.
+_TIMES = {
+    "shear": "shear",
+    "stretch": "shear",
+    "bend": "bend",
+    "twist": "bend",
+    "twist_minus_bend": "bend",
+    "inertia": "inertia",
+    "axial_inertia": "inertia",
+    "decay_rate": "rotational",
+    "weight_x": "mass",
+    "weight_y": "mass",
+    "weight_z": "mass",
+    "volume_over_pi": "volume",
+    "friction": "friction",
+}
+_OVER = {"dt_over_inertia": "inertia", "dt_over_axial_inertia": "inertia", "dt_over_mass": "mass"}
+_POWER = {
+    "translational_decay": "translational",
+    "bending_decay": "rotational",
+    "axial_decay": "rotational",
+}
+
+
+def coefficients_of(nominal: Coefficients, scales: Scales) -> Tensor:
+    """Give every environment's coefficients, ``(num_envs, 27)`` float64 on the scales' device; nothing waits for it.
+
+    ``nominal`` is of float64, as are the scales ``(num_envs,)``.
+    """
+    values = scales._asdict()
+    one = torch.ones_like(scales.mass)
+    factors = [values.get(_TIMES.get(name, ""), one) for name in nominal._fields]
+    divisors = [values.get(_OVER.get(name, ""), one) for name in nominal._fields]
+    powers = [values.get(_POWER.get(name, ""), one) for name in nominal._fields]
+    base = _as_tensor(nominal, one.device)
+    factor, divisor, power = (torch.stack(columns, dim=-1) for columns in (factors, divisors, powers))
+    decays = _as_tensor(tuple(name in _POWER for name in nominal._fields), one.device)
+    return torch.where(decays > 0.0, base**power, base * factor / divisor)
+
+
+@lru_cache
+def _as_tensor(values: tuple[Any, ...], device: torch.device) -> Tensor:
+    """Numbers as a float64 tensor that is copied to the device once."""
+    return torch.tensor([float(value) for value in values], dtype=torch.float64, device=device)
+
+
+def make_own(drawn: bool) -> Callable[..., Any]:
+    """Make the device function that gives a block the ``Coefficients`` of its rod.
+
+    They are the kernel's argument itself where all rods are one, and a row of it, ``(num_envs, 27)``, for ``drawn``
+    bodies.
+    """
+
+    def own(given, b):
+        return given
+
+    def row(given, b):
+        return Coefficients(
+            given[b, 0], given[b, 1], given[b, 2], given[b, 3], given[b, 4], given[b, 5], given[b, 6], given[b, 7],
+            given[b, 8], given[b, 9], given[b, 10], given[b, 11], given[b, 12], given[b, 13], given[b, 14],
+            given[b, 15], given[b, 16], given[b, 17], given[b, 18], given[b, 19], given[b, 20], given[b, 21],
+            given[b, 22], given[b, 23], given[b, 24], given[b, 25], given[b, 26],
+        )  # fmt: skip
+
+    return device(row if drawn else own)
 
 
 class Physics(NamedTuple):

@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -26,19 +26,23 @@ REAL = {torch.float64: np.float64, torch.float32: np.float32}  # what kernels co
 def launch(kernel: Any, blocks: int, threads: int, tensors: Sequence[Tensor], *scalars: Any) -> None:
     """Enqueue a kernel on the current stream of the tensors' device, with the tensors and then ``scalars``.
 
-    Without blocks there is nothing to launch. No tensor may be empty.
+    A tensor among the scalars is handed on as the others are. Without blocks there is nothing to launch. No tensor may
+    be empty.
     """
     if not blocks:
         return
-    tensors = [tensor.detach() for tensor in tensors]  # gradients do not pass through kernels
     if SIMULATED:
-        kernel[blocks, threads](*(tensor.numpy() for tensor in tensors), *scalars)
+        kernel[blocks, threads](*_given(lambda tensor: tensor.numpy(), *tensors, *scalars))
         return
     device = tensors[0].device
     with cuda.gpus[device.index]:
-        arrays = [cuda.as_cuda_array(tensor, sync=False) for tensor in tensors]
         stream = cuda.external_stream(torch.cuda.current_stream(device).cuda_stream)
-        kernel[blocks, threads, stream](*arrays, *scalars)
+        kernel[blocks, threads, stream](*_given(partial(cuda.as_cuda_array, sync=False), *tensors, *scalars))
+
+
+def _given(array: Callable[[Tensor], Any], *arguments: Any) -> list[Any]:
+    """Arguments as a kernel takes them; gradients do not pass through kernels."""
+    return [array(value.detach()) if isinstance(value, Tensor) else value for value in arguments]
 
 
 @lru_cache

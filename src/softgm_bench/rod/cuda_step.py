@@ -15,7 +15,7 @@ import numpy as np
 from numba import cuda
 
 from softgm_bench.rod.cuda_contact import make_no_press, make_press
-from softgm_bench.rod.cuda_kernel import SIMULATED, device, make_physics
+from softgm_bench.rod.cuda_kernel import SIMULATED, device, make_own, make_physics
 from softgm_bench.rod.parameters import RodParameters, rod_constants
 
 MAX_ELEMENTS = 1023  # a block has a thread for each node, 1024 at most
@@ -27,7 +27,9 @@ _SHARED_BYTES = 49152  # that a block can have without asking
 
 
 @lru_cache
-def make_step(n_elements: int, real: type, contact: str | None, moving: bool = False) -> Callable[..., Any]:
+def make_step(
+    n_elements: int, real: type, contact: str | None, moving: bool = False, drawn: bool = False
+) -> Callable[..., Any]:
     """Build the kernel for one element count, precision and contact model; Numba compiles it at its first launch.
 
     Cylinders that stand still have a kernel without a trace of motion, ``moving`` ones have one of their own.
@@ -35,22 +37,24 @@ def make_step(n_elements: int, real: type, contact: str | None, moving: bool = F
     Launch with a block for each rod and ``n_elements + 1`` threads. Arguments: the state's four arrays, the four that
     receive the new state, couple, force, active, the cylinders' five arrays (never read without a contact model) and
     their velocities (never read unless they are moving), scratch (see ``scratch_columns``), whether (1 or 0) force and
-    active are given, ``Coefficients``, the substeps.
+    active are given, ``Coefficients`` (of ``drawn`` bodies a row of them for each rod, ``(num_envs, 27)``), the
+    substeps.
     """
     n, n_columns, zero = n_elements, n_elements + 2, real(0.0)
     on_chip = scratch_columns(n, real) == 0
     far = real(1e30)
     load, loads, store = _make_load(n, real), _make_loads(n, real), _make_store(n)
-    drift, show = _make_drift(real), device(_show)
+    drift, show, own = _make_drift(real), device(_show), make_own(drawn)
     act, accelerate = _make_act(n, real, contact, moving), _make_accelerate(n, real)
     single, straighten = real is np.float32, make_physics(real).straighten
 
     def step(
         position, director, velocity, omega, new_position, new_director, new_velocity, new_omega,
-        couple, force, active, start, axis, length, radius, mask, velocities, scratch, with_force, with_active, c,
+        couple, force, active, start, axis, length, radius, mask, velocities, scratch, with_force, with_active, given,
         substeps,
     ):  # fmt: skip
         b, k = cuda.blockIdx.x, cuda.threadIdx.x
+        c = own(given, b)
         if on_chip:
             node = cuda.shared.array((15, n_columns), real)
             joint = cuda.shared.array((7, n_columns), real)  # of element k in column k + 1, between what has no element

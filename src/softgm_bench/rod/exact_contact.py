@@ -36,6 +36,7 @@ def exact_contact_forces(
     cylinders: Cylinders,
     parameters: RodParameters,
     cylinder_velocity: Tensor | None = None,
+    friction: Tensor | None = None,
 ) -> Tensor:
     """Return the forces of cylinders on the rods' nodes in N, integrals of the density above over the contact.
 
@@ -50,6 +51,7 @@ def exact_contact_forces(
         cylinders: of the same ``num_envs``; values of masked ones are never read.
         parameters: stiffness, damping, friction and the length that they refer to.
         cylinder_velocity: m/s, ``(num_envs, n_cylinders, 3)``; None: they rest.
+        friction: the environments' coefficients of friction, ``(num_envs, 1, 1)``; None: the parameters'.
 
     Returns:
         ``(num_envs, 3, n_nodes)`` in the world frame.
@@ -73,7 +75,7 @@ def exact_contact_forces(
     approach = -(velocity[:, None, :, :-1] + xi * (velocity[..., 1:] - velocity[..., :-1])[:, None])
     if cylinder_velocity is not None:
         approach = approach + cylinder_velocity[..., None]
-    density = _force_density(start + xi * edge, approach, axis, length, reach, parameters)
+    density = _force_density(start + xi * edge, approach, axis, length, reach, parameters, friction)
     rest_length = parameters.base_length / parameters.n_elements
     force = (weights * (rest_length * (leave - enter))).unsqueeze(-2) * density
 
@@ -157,7 +159,13 @@ def _inside_slab(along: Tensor, rate: Tensor, length: Tensor, flat: Tensor) -> t
 
 
 def _force_density(
-    point: Tensor, approach: Tensor, axis: Tensor, length: Tensor, reach: Tensor, parameters: RodParameters
+    point: Tensor,
+    approach: Tensor,
+    axis: Tensor,
+    length: Tensor,
+    reach: Tensor,
+    parameters: RodParameters,
+    friction: Tensor | None,
 ) -> Tensor:
     """Force of the rod on the cylinder per metre of rest arc length, ``(..., 3, n_elements)``, N/m.
 
@@ -178,5 +186,5 @@ def _force_density(
     slip = approach - normal_speed.unsqueeze(-2) * normal
     slip_speed = safe_norm(slip)
     viscous = 2.0 * parameters.velocity_damping_coefficient / parameters.contact_length * slip_speed
-    limit = parameters.friction_coefficient * magnitude.abs()
+    limit = (parameters.friction_coefficient if friction is None else friction) * magnitude.abs()
     return force - (torch.minimum(viscous, limit) / (slip_speed + 1e-14)).unsqueeze(-2) * slip

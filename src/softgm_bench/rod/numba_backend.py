@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from softgm_bench.rod import forks
+from softgm_bench.rod.bodies import Bodies, scales
+from softgm_bench.rod.numba_bodies import FRICTION, MASS, TRANSLATIONAL, VOLUME, make_shape
 from softgm_bench.rod.numba_contact import (
     COLUMNS,
     MOVING_COLUMNS,
@@ -29,6 +31,7 @@ from softgm_bench.rod.numba_kernel import jit, larger, make_kernel, make_straigh
 from softgm_bench.rod.numba_layout import CACHE_LINE, Layout, constant_rows, make_layout
 from softgm_bench.rod.parameters import RodParameters, rod_constants
 from softgm_bench.rod.scalar_contact import EDGE, RADIUS, START
+from softgm_bench.rod.scalar_contact import FRICTION as COULOMB
 from softgm_bench.rod.state import Cylinders, RodState, check_inputs, refuse_gradients
 
 
@@ -53,6 +56,7 @@ class NumbaBackend:
         active: Tensor | None = None,
         substeps: int | None = None,
         cylinder_velocity: Tensor | None = None,
+        bodies: Bodies | None = None,
     ) -> RodState:
         """Advance every rod by one control step.
 
@@ -65,6 +69,7 @@ class NumbaBackend:
             substeps: of this step, the parameters' number by default.
             cylinder_velocity: with which the cylinders move on from where they are now, m/s, without turning,
                 ``(num_envs, n_cylinders, 3)``; constant in the step. By default they stand still.
+            bodies: factors on the parameters, an arm for each environment; by default all are the nominal one.
 
         Returns:
             A new state.
@@ -72,21 +77,23 @@ class NumbaBackend:
         Raises:
             ValueError: if the arguments' shapes do not fit together, or a gradient is asked for.
         """
-        check_inputs(self.parameters, state, couple, force, cylinders, active, cylinder_velocity)
+        check_inputs(self.parameters, state, couple, force, cylinders, active, cylinder_velocity, bodies)
         forks.check()
-        refuse_gradients("numba", state, couple, force)
+        refuse_gradients("numba", state, couple, force, bodies)
         dtype = state.position.dtype
         num_envs, n = couple.shape[0], self.parameters.n_elements
-        rows, scalars, contact = self._table(dtype)
+        rows, *shared = self._table(dtype)
+        scaled = None if bodies is None else _scale_table(bodies, self.parameters)
         new = state.clone()
         arrays = [field.numpy() for field in (new.position, new.director, new.velocity, new.omega)]
-        weight = self._weight.to(dtype).expand(num_envs, 3, n + 1)
+        weight = self._weight if scaled is None else scaled[:, MASS, None, None] * self._weight
+        weight = weight.to(dtype).expand(num_envs, 3, n + 1)
         total_force = (weight if force is None else force.to(dtype) + weight).contiguous()
         table = _cylinder_table(cylinders, cylinder_velocity, num_envs, dtype)
         if active is None:
             active = torch.ones(num_envs, dtype=torch.bool)
         moving = cylinder_velocity is not None
-        step = _make_step(n, arrays[0].dtype.type, self.parameters.contact_model, moving)
+        step = _make_step(n, arrays[0].dtype.type, self.parameters.contact_model, moving, bodies is not None)
         step(
             *arrays,
             couple.detach().to(dtype).contiguous().numpy(),
@@ -94,8 +101,7 @@ class NumbaBackend:
             table.numpy(),
             active.contiguous().numpy(),
             rows,
-            scalars,
-            contact,
+            *(shared if scaled is None else _each(scaled.to(dtype).numpy(), *shared)),
             self.parameters.substeps if substeps is None else substeps,
         )
         forks.note_threads()
@@ -130,11 +136,26 @@ def _cylinder_table(cylinders: Cylinders | None, velocity: Tensor | None, num_en
     return table
 
 
+def _scale_table(bodies: Bodies, parameters: RodParameters) -> Tensor:
+    """Columns in the order of ``Scales``, ``(num_envs, 8)`` float64."""
+    return torch.stack(scales(Bodies(*(factor.detach().double() for factor in bodies)), parameters), dim=-1)
+
+
+def _each(scaled: NDArray, scalars: NDArray, contact: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """Every environment's scales, scalars and contact coefficients, ``(num_envs, ..)`` each, from the nominal arm's."""
+    dt, decay, volume = scalars
+    own = np.stack([np.full_like(scaled[:, 0], dt), decay ** scaled[:, TRANSLATIONAL], volume * scaled[:, VOLUME]], 1)
+    touch = np.tile(contact, (len(scaled), 1))
+    touch[:, COULOMB] *= scaled[:, FRICTION]
+    return scaled, own, touch
+
+
 @lru_cache
-def _make_step(n_elements: int, dtype: type, contact_model: str, moving: bool) -> Callable[..., Any]:
+def _make_step(n_elements: int, dtype: type, contact_model: str, moving: bool, drawn: bool) -> Callable[..., Any]:
     """Compile the loop over environments and substeps for one element count, precision and contact model.
 
-    Cylinders that stand still have a loop without a trace of motion.
+    Cylinders that stand still have a loop without a trace of motion, and rods that are all the nominal one another loop
+    than ``drawn`` bodies.
     """
     layout = told_apart(make_layout(n_elements, dtype), contact_model, moving)
     itemsize = np.dtype(dtype).itemsize
@@ -156,13 +177,31 @@ def _make_step(n_elements: int, dtype: type, contact_model: str, moving: bool) -
                     straighten(s)
                 store(s, position[b], director[b], velocity[b], omega[b])
 
+    def control_step_of_bodies(
+        position, director, velocity, omega, couple, force, cylinders, active, rows, scales, scalars, contact, substeps
+    ):
+        for b in numba.prange(position.shape[0]):
+            if active[b]:
+                memory = np.empty(layout.size + width, rows.dtype)
+                skip = (-memory.ctypes.data % CACHE_LINE) // itemsize
+                s = memory[skip : skip + layout.size]
+                s[:] = rows
+                shape(s, scales[b])
+                load(s, position[b], director[b], velocity[b], omega[b], couple[b], force[b])
+                advance(s, cylinders[b], scalars[b], contact[b], substeps)
+                if single:
+                    straighten(s)
+                store(s, position[b], director[b], velocity[b], omega[b])
+
+    callees: dict[str, Any] = {"shape": make_shape(layout, dtype)} if drawn else {}
     return jit(
-        control_step,
+        control_step_of_bodies if drawn else control_step,
         parallel=True,
         load=_make_load(layout),
         store=_make_store(layout),
         advance=_make_advance(layout, dtype, contact_model, moving),
         straighten=make_straighten(layout, dtype),
+        **callees,
     )
 
 

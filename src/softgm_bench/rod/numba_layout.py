@@ -146,6 +146,6 @@ def constant_rows(parameters: RodParameters, layout: Layout, dtype: np.dtype) ->
 def _source_digest() -> int:
     folder = Path(__file__).parent
     digest = hashlib.sha256()
-    for path in [*sorted(folder.glob("numba_*.py")), folder / "scalar_contact.py"]:
+    for path in [*sorted(folder.glob("numba_*.py")), folder / "scalar_contact.py", folder / "bodies.py"]:
         digest.update(path.read_bytes())
     return int.from_bytes(digest.digest()[:7], "big")

@@ -1,6 +1,7 @@
 """This module holds the arm's physical parameters and derives the constants of the discretised rod from them."""
 
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -116,6 +117,17 @@ class RodParameters:
     def control_dt(self) -> float:
         """Return the duration of one control step in s."""
         return self.dt * self.substeps
+
+    def times(self, factors: Mapping[str, float]) -> "RodParameters":
+        """Return an arm with so many times these parameters, by name; the shear modulus goes with Young's.
+
+        Raises:
+            ValueError: if that is no rod.
+        """
+        values = {name: getattr(self, name) * factor for name, factor in factors.items()}
+        if "youngs_modulus" in factors:
+            values["shear_modulus"] = self.shear_modulus * factors["youngs_modulus"]
+        return replace(self, **values)
 
 
 class RodConstants(NamedTuple):

@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from softgm_bench.errors import UserError
+from softgm_bench.rod.bodies import Bodies
 from softgm_bench.rod.parameters import RodParameters
 from softgm_bench.rod.state import Cylinders, RodState, check_inputs, refuse_gradients
 
@@ -45,7 +46,7 @@ class PyElasticaBackend:
         self.parameters, self.missed = parameters, 0
         self.contact_force = torch.zeros(0, dtype=torch.float64)
         self._oracle, self._pruning = oracle, pruning
-        self._arms: dict[tuple[oracle.Post, ...], oracle.Arm] = {}
+        self._arms: dict[tuple[RodParameters, tuple[oracle.Post, ...]], oracle.Arm] = {}
 
     def control_step(
         self,
@@ -56,12 +57,13 @@ class PyElasticaBackend:
         active: Tensor | None = None,
         substeps: int | None = None,
         cylinder_velocity: Tensor | None = None,
+        bodies: Bodies | None = None,
     ) -> RodState:
         """Advance every rod by one control step.
 
-        A simulator is built where cylinders of some lengths, radii and directions are met for the first time and kept
-        while they are met. It is told before the step where they are, how they move and each rod's state, so rods among
-        such cylinders share it.
+        A simulator is built where a body, or cylinders of some lengths, radii and directions, are met for the first
+        time and kept while they are met. It is told before the step where they are, how they move and each rod's
+        state, so equal rods among such cylinders share it.
 
         Args:
             state: not changed; float64 on the CPU.
@@ -72,6 +74,7 @@ class PyElasticaBackend:
             substeps: of this step, the parameters' number by default.
             cylinder_velocity: with which the cylinders move on from where they are now, m/s, without turning,
                 ``(num_envs, n_cylinders, 3)``; constant in the step. By default they stand still.
+            bodies: factors on the parameters, an arm for each environment; by default all are the nominal one.
 
         Returns:
             A new state.
@@ -80,8 +83,8 @@ class PyElasticaBackend:
             ValueError: if the arguments' shapes do not fit together, the state is not float64 on the CPU, or a gradient
                 is asked for.
         """
-        check_inputs(self.parameters, state, couple, force, cylinders, active, cylinder_velocity)
-        refuse_gradients("pyelastica", state, couple, force)
+        check_inputs(self.parameters, state, couple, force, cylinders, active, cylinder_velocity, bodies)
+        refuse_gradients("pyelastica", state, couple, force, bodies)
         if state.position.dtype != torch.float64 or state.position.device.type != "cpu":
             raise ValueError(
                 f"the state is {state.position.dtype} on {state.position.device}: the pyelastica backend computes in "
@@ -91,16 +94,20 @@ class PyElasticaBackend:
         num_envs = len(couple)
         rows = range(num_envs) if active is None else active.nonzero().flatten().tolist()
         posts = {row: () if cylinders is None else self._oracle.posts_of(cylinders, row) for row in rows}
-        shapes = {row: tuple(post._replace(start=(0.0, 0.0, 0.0)) for post in met) for row, met in posts.items()}
-        self._arms = {
-            met: self._arms.get(met) or self._oracle.Arm(self.parameters, met, carried=True) for met in shapes.values()
+        kinds = {
+            row: (
+                self.parameters if bodies is None else bodies.arm(self.parameters, row),
+                tuple(post._replace(start=(0.0, 0.0, 0.0)) for post in met),
+            )
+            for row, met in posts.items()
         }
+        self._arms = {kind: self._arms.get(kind) or self._oracle.Arm(*kind, carried=True) for kind in kinds.values()}
         self.contact_force = torch.zeros(num_envs, dtype=torch.float64)
         couples = couple.detach().double().numpy()
         forces = None if force is None else force.detach().double().numpy()
         with self._oracle.watched_pruning(self._pruning) as watched:
             for row, met in posts.items():
-                arm = self._arms[shapes[row]]
+                arm = self._arms[kinds[row]]
                 arm.carry([post.start for post in met], _velocity(cylinders, cylinder_velocity, row))
                 fields = [field[row].numpy() for field in (new.position, new.director, new.velocity, new.omega)]
                 for theirs, ours in zip(arm.state, fields, strict=True):

@@ -51,9 +51,13 @@ def check_time_step(parameters: RodParameters) -> None:
     limit = MARGIN * longest_time_step(parameters)
     if parameters.dt <= limit:
         return
-    substeps = math.ceil(parameters.control_dt / (0.9 * limit))
     raise ValueError(
         f"rod.dt={parameters.dt:g}: with n_elements, base_length, base_radius, density and moduli as they are, the "
-        f"integrator is stable up to {limit:.3g} s; give rod.dt={parameters.control_dt / substeps:.6g} "
-        f"rod.substeps={substeps}"
+        f"integrator is stable up to {limit:.3g} s; give {finer_step(parameters, limit)}"
     )
+
+
+def finer_step(parameters: RodParameters, limit: float) -> str:
+    """Write the settings of a time step well below ``limit`` s that divides the control step."""
+    substeps = math.ceil(parameters.control_dt / (0.9 * limit))
+    return f"rod.dt={parameters.control_dt / substeps:.6g} rod.substeps={substeps}"

@@ -6,6 +6,7 @@ import torch
 from tensordict import TensorClass
 from torch import Tensor
 
+from softgm_bench.rod.bodies import Bodies
 from softgm_bench.rod.parameters import RodParameters, rod_constants
 
 
@@ -81,16 +82,18 @@ def dilatation(position: Tensor, rest_length: Tensor) -> Tensor:
     return edges.norm(dim=-2) / rest_length
 
 
-def refuse_gradients(backend: str, state: RodState, couple: Tensor, force: Tensor | None) -> None:
+def refuse_gradients(
+    backend: str, state: RodState, couple: Tensor, force: Tensor | None, bodies: Bodies | None = None
+) -> None:
     """Refuse a step whose gradient would be asked for, in a kernel that has none.
 
     Raises:
         ValueError: naming what would do.
     """
-    tensors = (couple, force, state.position, state.director, state.velocity, state.omega)
+    tensors = (couple, force, state.position, state.director, state.velocity, state.omega, *(bodies or ()))
     if torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in tensors):
         raise ValueError(
-            f"the action, force or state requires a gradient, and backend={backend} has none: "
+            f"the action, force, state or body requires a gradient, and backend={backend} has none: "
             "choose backend=torch, or step under torch.no_grad()"
         )
 
@@ -103,6 +106,7 @@ def check_inputs(
     cylinders: Cylinders | None,
     active: Tensor | None,
     cylinder_velocity: Tensor | None = None,
+    bodies: Bodies | None = None,
 ) -> None:
     """Refuse arguments that do not fit together before any kernel reads them.
 
@@ -124,6 +128,8 @@ def check_inputs(
         "cylinders.mask": (None if cylinders is None else cylinders.mask, (num_envs, -1)),
         "cylinder_velocity": (cylinder_velocity, (num_envs, n_cylinders, 3)),
     }
+    if bodies is not None:
+        expected |= {f"bodies.{name}": (factor, (num_envs,)) for name, factor in bodies._asdict().items()}
     for name, (tensor, shape) in expected.items():
         if tensor is None:
             continue

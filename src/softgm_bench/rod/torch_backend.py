@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from softgm_bench.rod.bodies import Bodies, scales
 from softgm_bench.rod.contact import contact_forces, element_length, element_radius
 from softgm_bench.rod.exact_contact import exact_contact_forces
 from softgm_bench.rod.parameters import RodParameters, rod_constants
@@ -107,6 +108,7 @@ class TorchBackend:
         active: Tensor | None = None,
         substeps: int | None = None,
         cylinder_velocity: Tensor | None = None,
+        bodies: Bodies | None = None,
     ) -> RodState:
         """Advance by one control step, with loads held constant.
 
@@ -119,6 +121,7 @@ class TorchBackend:
             substeps: Verlet steps of ``parameters.dt``; ``parameters.substeps`` by default.
             cylinder_velocity: with which the cylinders move on from where they are now, m/s, without turning,
                 ``(num_envs, n_cylinders, 3)``; constant in the step. By default they stand still.
+            bodies: factors on the parameters, an arm for each environment; by default all are the nominal one.
 
         Returns:
             A new state.
@@ -126,11 +129,11 @@ class TorchBackend:
         Raises:
             ValueError: if the arguments' shapes do not fit together.
         """
-        check_inputs(self.parameters, state, couple, force, cylinders, active, cylinder_velocity)
+        check_inputs(self.parameters, state, couple, force, cylinders, active, cylinder_velocity, bodies)
         motion = Motion(state.position, state.director, state.velocity, state.omega)
         obstacles = _obstacles(cylinders, cylinder_velocity)
         if active is None:
-            moved = self._advance(motion, couple, force, obstacles, substeps)
+            moved = self._advance(motion, couple, force, obstacles, substeps, bodies)
         else:
             # Resting environments aren't computed at all: one that has diverged can't poison gradients.
             chosen = active.nonzero().squeeze(-1)
@@ -140,20 +143,34 @@ class TorchBackend:
                 None if force is None else force[chosen],
                 None if obstacles is None else obstacles.of(chosen),
                 substeps,
+                None if bodies is None else bodies.of(chosen),
             )
             moved = Motion(*(old.index_put((chosen,), new) for old, new in zip(motion, moved, strict=True)))
         return RodState(**moved._asdict(), batch_size=state.batch_size)
 
     def _advance(
-        self, motion: Motion, couple: Tensor, force: Tensor | None, obstacles: Obstacles | None, substeps: int | None
+        self,
+        motion: Motion,
+        couple: Tensor,
+        force: Tensor | None,
+        obstacles: Obstacles | None,
+        substeps: int | None,
+        bodies: Bodies | None,
     ) -> Motion:
         """``control_step`` on plain tensors, every environment moving."""
-        constants = self._constants_like(motion.position)
-        external_force = constants.weight if force is None else constants.weight + force
+        weight = self._constants_of(bodies, motion.position).weight
+        external_force = weight if force is None else weight + force
 
         def segment(
-            begun: int, end: int, motion: Motion, couple: Tensor, force: Tensor, obstacles: Obstacles | None
+            begun: int,
+            end: int,
+            motion: Motion,
+            couple: Tensor,
+            force: Tensor,
+            obstacles: Obstacles | None,
+            bodies: Bodies | None,
         ) -> Motion:
+            constants = self._constants_of(bodies, motion.position)
             for substep in range(begun, end):
                 # contact acts in the middle of a substep
                 cylinders = None if obstacles is None else obstacles.at((substep + 0.5) * self.parameters.dt)
@@ -163,11 +180,11 @@ class TorchBackend:
 
         substeps = self.parameters.substeps if substeps is None else substeps
         if self.checkpoint_every is None or not torch.is_grad_enabled():
-            motion = segment(0, substeps, motion, couple, external_force, obstacles)
+            motion = segment(0, substeps, motion, couple, external_force, obstacles, bodies)
         else:
             for begun in range(0, substeps, self.checkpoint_every):
                 end = min(begun + self.checkpoint_every, substeps)
-                motion = _recomputed(partial(segment, begun, end), motion, couple, external_force, obstacles)
+                motion = _recomputed(partial(segment, begun, end), motion, couple, external_force, obstacles, bodies)
         if motion.director.dtype == torch.float32:
             motion = motion._replace(director=straightened(motion.director))
         return motion
@@ -191,20 +208,48 @@ class TorchBackend:
         if cylinders is not None:
             radius = element_radius(motion.position, constants.volume)
             contact = _CONTACT_FORCES[self.parameters.contact_model]
-            force = force + contact(
-                motion.position, motion.velocity, radius, cylinders, self.parameters, cylinder_velocity
-            )
+            given = (radius, cylinders, self.parameters, cylinder_velocity, constants.friction)
+            force = force + contact(motion.position, motion.velocity, *given)
         torque = internal_torques(motion, stress, now, constants) + couple
 
         motion = dynamic_step(motion, force, torque, now.dilatation, constants, dt)
         motion = dampen(constrain_rates(motion), now.dilatation, constants)
         return constrain_values(kinematic_step(motion, 0.5 * dt), constants)
 
+    def _constants_of(self, bodies: Bodies | None, tensor: Tensor) -> SimpleNamespace:
+        """The constants of the nominal rod, or of every environment's, in the tensor's dtype and on its device.
+
+        The latter have ``num_envs`` in front and sizes of 1 by which they broadcast.
+        """
+        nominal = self._constants_like(tensor)
+        if bodies is None:
+            return nominal
+        s = scales(Bodies(*(factor.to(tensor) for factor in bodies)), self.parameters)
+        own = {name: factor[:, None] for name, factor in s._asdict().items()}  # (num_envs, 1), ones of 3 dimensions:
+        wide = {name: factor[..., None] for name, factor in own.items()}
+        return SimpleNamespace(
+            **(
+                vars(nominal)
+                | {
+                    "volume": own["volume"] * nominal.volume,
+                    "mass": wide["mass"] * nominal.mass,
+                    "weight": wide["mass"] * nominal.weight,
+                    "inertia": wide["inertia"] * nominal.inertia,
+                    "shear": wide["shear"] * nominal.shear,
+                    "bend": wide["bend"] * nominal.bend,
+                    "translational_decay": nominal.translational_decay ** wide["translational"],
+                    "rotational_decay_rate": wide["rotational"] * nominal.rotational_decay_rate,
+                    "friction": wide["friction"] * self.parameters.friction_coefficient,
+                }
+            )
+        )
+
     def _constants_like(self, tensor: Tensor) -> SimpleNamespace:
         """The rod's constants, and the nodes' weight ``(3, n_nodes)``, in the tensor's dtype and on its device."""
         key = (tensor.dtype, tensor.device)
         if key not in self._tensors:
             fields = self._constants._asdict()
+            fields["friction"] = None  # the parameters'
             fields["weight"] = np.array(self.parameters.gravity)[:, None] * self._constants.mass
             for name, value in fields.items():
                 if isinstance(value, np.ndarray):
@@ -251,7 +296,12 @@ def _obstacles(cylinders: Cylinders | None, velocity: Tensor | None) -> Obstacle
 
 
 def _recomputed(
-    segment: Callable[..., Motion], motion: Motion, couple: Tensor, force: Tensor, obstacles: Obstacles | None
+    segment: Callable[..., Motion],
+    motion: Motion,
+    couple: Tensor,
+    force: Tensor,
+    obstacles: Obstacles | None,
+    bodies: Bodies | None,
 ) -> Motion:
     """``segment`` of the other arguments with gradients for each of them, through ``_Recomputed``."""
     shapes: tuple[Tensor, ...] = ()
@@ -261,15 +311,15 @@ def _recomputed(
         shapes += () if velocity is None else (velocity,)
 
     def run(*inputs: Tensor) -> Motion:
-        seen = None
+        seen, (position, director, moving, omega, couple, force) = None, inputs[:6]
+        given, factors = inputs[6 : 6 + len(shapes)], inputs[6 + len(shapes) :]
         if obstacles is not None:
             mask, size = obstacles.cylinders.mask, obstacles.cylinders.batch_size
-            seen = Obstacles(
-                Cylinders(*inputs[6:10], mask=mask, batch_size=size), inputs[10] if len(inputs) > 10 else None
-            )
-        return segment(Motion(*inputs[:4]), inputs[4], inputs[5], seen)
+            seen = Obstacles(Cylinders(*given[:4], mask=mask, batch_size=size), given[4] if len(given) > 4 else None)
+        motion = Motion(position, director, moving, omega)
+        return segment(motion, couple, force, seen, Bodies(*factors) if factors else None)
 
-    return Motion(*_Recomputed.apply(run, *motion, couple, force, *shapes))
+    return Motion(*_Recomputed.apply(run, *motion, couple, force, *shapes, *(bodies or ())))
 
 
 def kinematic_step(motion: Motion, duration: float) -> Motion:
