@@ -32,7 +32,11 @@ MISTAKES = {
     "two paths": (["a", "b"], True, "give one run, found a, b; "),
     "an option": (["--fast"], True, "give one run, found --fast; "),
     "unknown": (["a", "episode=3"], True, "episode: no such setting; did you mean episodes?"),
-    "unlike any": (["a", "xyz=3"], True, "xyz: no such setting; choose from episodes, out, task, rod, perturbation, "),
+    "unlike any": (
+        ["a", "xyz=3"],
+        True,
+        "xyz: no such setting; choose from episodes, out, task, rod, perturbation, randomise, ",
+    ),
     "nothing of a policy's": (["a", "task=wall"], False, "task: no such setting; choose from episodes, out"),
     "wrong type": (["a", "episodes=many"], True, "episodes: Value 'many' of type 'str' could not be"),
     "unreadable": (["a", "out=[1"], True, "out=[1: a value that cannot be read"),

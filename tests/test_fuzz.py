@@ -33,6 +33,8 @@ KEYS = st.sampled_from(
         "device",
         "run_dir",
         "perturbation",
+        "randomise",
+        "randomise.density",
         "logger",
         "+new",
         "~task",

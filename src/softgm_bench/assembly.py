@@ -48,7 +48,7 @@ def build_env(config: Config, num_envs: int, seed: int, horizon: int | None = No
     """Build ``num_envs`` environments of a checked configuration: an ``EnvBase`` that is an ``Environment``.
 
     Args:
-        config: of which task, arm, device, backend, precision and perturbation count.
+        config: of which task, arm, its bodies, device, backend, precision and perturbation count.
         num_envs: simulated at once.
         seed: of everything that the environments draw.
         horizon: control steps of an episode; None: the task's own.

@@ -1,3 +1,5 @@
+import re
+
 import pytest
 from refused import refusal
 
@@ -14,6 +16,23 @@ def test_mistakes_in_perturbations_are_one_line():
     assert absent == "perturbation.failed_agents holds 7: the 6 agents are 0 to 5"
     vmas = refusal("perturbation=noise", "task=vmas_balance", "model=vector_mlp")
     assert vmas == "perturbation=noise: task=vmas_balance has no arm; it must be none"
+
+
+def test_mistakes_in_bodies_are_one_line():
+    assert refusal("randomise=wid").startswith("randomise=wid: no such randomise; choose one of moderate, none, wide")
+    assert refusal("randomise.mass=[1,2]").startswith("randomise.mass: no such key; did you mean randomise.")
+    assert refusal("randomise.density=[0.9,1.1]").startswith("randomise.density is [0.9, 1.1] with randomise=none: ")
+    assert refusal("randomise=wide", "randomise.density=[1.1,0.9]").startswith(
+        "randomise.density=[1.1, 0.9]: the lower end of a range comes first"
+    )
+    assert refusal("randomise=wide", "randomise.density=[1.0]").endswith("it must be a range, [low, high]")
+    torn = refusal("randomise=wide", "randomise.youngs_modulus=[0.5,4]")
+    assert torn.startswith("randomise.youngs_modulus=[0.5,4] randomise.density=[0.8,1.25]")
+    assert re.search(r"narrow them or give rod\.dt=\S+ rod\.substeps=\d+$", torn)
+    rough = refusal("randomise=wide", "randomise.friction_coefficient=[0.5,2]", "task=wall")
+    assert rough.startswith("randomise.friction_coefficient=[0.5,2]: the nominal arm has no friction to multiply")
+    vmas = refusal("randomise=wide", "task=vmas_balance", "model=vector_mlp")
+    assert vmas == "randomise=wide: task=vmas_balance has no arm; it must be none"
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from softgm_bench.assembly import configure
 from softgm_bench.config import compose, config_directory, plain
 from softgm_bench.envs import PerturbationConfig
 from softgm_bench.envs.tasks import TASK_CONFIGS
+from softgm_bench.rod.randomise import FACTORS
 
 FILES = sorted(config_directory().rglob("*.yaml"))
 
@@ -21,9 +22,9 @@ def test_every_file_sets_a_value(file):
 
 
 def test_there_are_few_files_and_each_stands_in_a_group():
-    assert len(FILES) <= 60
+    assert len(FILES) <= 64
     groups = {file.relative_to(config_directory()).parts[0] for file in FILES} - {"config.yaml"}
-    assert groups == {"task", "model", "algo", "experiment", "recipe", "perturbation", "logger", "grids"}
+    assert groups == {"task", "model", "algo", "experiment", "recipe", "perturbation", "randomise", "logger", "grids"}
     defaults = OmegaConf.load(config_directory() / "config.yaml").defaults
     assert all("optional" not in str(entry) and "$" not in str(entry) for entry in defaults)
 
@@ -157,6 +158,16 @@ def test_perturbations_are_the_papers_and_every_number_can_be_set():
     ]
     config = compose(["perturbation=noise", "perturbation.position_sigma=0.05", "perturbation.failed_agents=[0,5]"])
     assert config.perturbation == PerturbationConfig("noise", 0.05, 0.1, 0.2, (0, 5))
+
+
+@pytest.mark.parametrize("task", TASK_CONFIGS)
+def test_bodies_of_every_range_can_be_simulated_with_the_arms_own_time_step_on_every_task(task):
+    inner, outer = (configure([f"task={task}", f"randomise={name}"]).randomise for name in ("moderate", "wide"))
+    assert set(inner.drawn) == set(outer.drawn) == set(FACTORS) - {"friction_coefficient"}
+    for name in inner.drawn:
+        low, high = getattr(outer, name)
+        assert low < getattr(inner, name)[0] < 1.0 < getattr(inner, name)[1] < high
+    assert compose(["randomise=wide", "randomise.density=[0.9,1.1]"]).randomise.density == (0.9, 1.1)
 
 
 def test_a_training_episode_is_as_long_as_the_command_line_says_or_the_task_or_the_experiment():

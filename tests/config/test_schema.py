@@ -5,6 +5,7 @@ from refused import refusal
 
 from softgm_bench.config import compose
 from softgm_bench.envs import PerturbationConfig
+from softgm_bench.rod.randomise import RandomiseConfig
 
 
 def test_another_model_than_an_algorithms_own_is_named_in_folder_and_label():
@@ -42,6 +43,15 @@ def test_what_was_trained_under_a_perturbation_says_so_wherever_its_results_go()
         assert not config.perturbation.nothing
     assert compose(["perturbation=noise", "perturbation.name=fog"]).label == "softgm_fog"
     assert compose([]).perturbation == PerturbationConfig()
+
+
+def test_what_was_trained_with_drawn_bodies_says_so_wherever_its_results_go():
+    for name in ("moderate", "wide"):
+        config = compose([f"randomise={name}", "algo=masac"])
+        assert config.label == f"masac_randomised_{name}"
+        assert config.run_dir == f"outputs/basic/masac_randomised_{name}/seed0"
+    assert compose(["randomise=wide", "perturbation=noise"]).label == "softgm_noise_randomised_wide"
+    assert compose([]).randomise == RandomiseConfig()
 
 
 @pytest.mark.parametrize("algo", ["softgm", "iddpg", "isac"])

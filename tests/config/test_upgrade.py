@@ -8,6 +8,7 @@ from omegaconf import OmegaConf
 from softgm_bench.config import compose, plain, typed
 from softgm_bench.config.upgrade import NEUTRAL, upgraded
 from softgm_bench.episodes import policy
+from softgm_bench.rod.randomise import RandomiseConfig
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 RUNS = sorted(EXPERIMENTS.rglob("config.yaml"))
@@ -82,6 +83,12 @@ def test_settings_of_today_are_left_as_they_are():
     values = plain(compose([]))
     assert upgraded(values) == values
     assert upgraded({}) == {}
+
+
+def test_runs_from_before_bodies_were_drawn_had_the_nominal_one():
+    values = before()
+    del values["randomise"]
+    assert typed(OmegaConf.create(values)).randomise == RandomiseConfig()
 
 
 def test_runs_from_before_there_were_perturbations_had_none():

@@ -24,7 +24,8 @@ from softgm_bench.config.upgrade import NEUTRAL, upgraded
 from softgm_bench.errors import UserError
 from softgm_bench.rod.parameters import RodParameters
 
-GROUPS = ("task", "rod", "perturbation")  # chosen by name, which trained policies can be evaluated with others of
+# chosen by name, which trained policies can be evaluated with others of
+GROUPS = ("task", "rod", "perturbation", "randomise")
 CHANGEABLE = (*GROUPS, "backend", "dtype")
 
 resolvers.register()

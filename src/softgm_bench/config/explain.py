@@ -61,7 +61,7 @@ def _nearest(key: str, overrides: list[str]) -> str:
 
 def _valid_keys(overrides: list[str]) -> Iterator[str]:
     """Every key of the configuration that the chosen groups make up, dotted."""
-    groups = r"(task|algo|model|recipe|experiment|rod|perturbation|logger)=\w+"
+    groups = r"(task|algo|model|recipe|experiment|rod|perturbation|randomise|logger)=\w+"
     choices = [override for override in overrides if re.fullmatch(groups, override)]
     try:
         config = compose_untyped(choices)

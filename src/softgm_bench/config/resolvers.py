@@ -57,7 +57,8 @@ def first(*values: Any) -> Any:
 def label(*, _root_: DictConfig) -> str:
     """Give the name of the results, ``Config.label``, for run folders."""
     cell = OmegaConf.select(_root_, "algo.actor.memory.cell")
-    return labelled(_root_.algo.name, _root_.model.name, _root_.observation, _root_.perturbation.name, cell)
+    changed = (_root_.perturbation.name, _root_.randomise.name)
+    return labelled(_root_.algo.name, _root_.model.name, _root_.observation, *changed, cell)
 
 
 def _node(value: Any) -> Any:

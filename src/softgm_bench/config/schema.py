@@ -6,6 +6,7 @@ from typing import Any
 from softgm_bench import plugins
 from softgm_bench.config.loggers import LoggerConfig
 from softgm_bench.rod.parameters import RodParameters
+from softgm_bench.rod.randomise import RandomiseConfig
 
 DTYPES = ("float64", "float32")
 NO_GRAPHS, GRAPHS = "none", "graph"
@@ -78,6 +79,7 @@ class Config:
     rod: RodParameters
     experiment: ExperimentConfig
     perturbation: Any  # a PerturbationConfig, which brings torch along
+    randomise: RandomiseConfig
     logger: LoggerConfig
 
     @property
@@ -100,11 +102,14 @@ class Config:
         """The algorithm's name as results carry it."""
         memory = getattr(getattr(self.algo, "actor", None), "memory", None)
         cell = None if memory is None else memory.cell
-        return labelled(self.algo.name, model_name(self.model), self.observation, self.perturbation.name, cell)
+        changed = (self.perturbation.name, self.randomise.name)
+        return labelled(self.algo.name, model_name(self.model), self.observation, *changed, cell)
 
 
-def labelled(algo: str, model: str, observation: str, perturbation: str, memory: str | None = None) -> str:
-    """``algo``, and whatever in model, memory, observation and perturbation makes its results another kind's.
+def labelled(
+    algo: str, model: str, observation: str, perturbation: str, randomise: str, memory: str | None = None
+) -> str:
+    """``algo``, and whatever in model, memory, observation, perturbation and bodies makes its results another kind's.
 
     SoftGM has the model that it is named after, the other algorithms an MLP; any other is named. A model whose name
     begins with the algorithm's, such as an ablation's, names both.
@@ -112,7 +117,8 @@ def labelled(algo: str, model: str, observation: str, perturbation: str, memory:
     own = "softgm" if algo.startswith("softgm") else "mlp"
     if model.startswith(f"{algo}_"):
         algo, own = model, model
-    usual = ((own, model), (None, memory), ("standard", observation), ("none", perturbation))
+    bodies = "none" if randomise == "none" else f"randomised_{randomise}"
+    usual = ((own, model), (None, memory), ("standard", observation), ("none", perturbation), ("none", bodies))
     return "_".join([algo, *(value for default, value in usual if value is not None and value != default)])
 
 

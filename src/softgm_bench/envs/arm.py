@@ -13,6 +13,7 @@ from softgm_bench.envs.tasks import TASK_CONFIGS, TaskConfig, make_task
 from softgm_bench.rod import forks
 from softgm_bench.rod.backend import default_backend, make_backend
 from softgm_bench.rod.parameters import RodParameters
+from softgm_bench.rod.randomise import RandomiseConfig
 from softgm_bench.rod.stability import check_time_step
 
 SCENES = 1024  # of a check
@@ -32,17 +33,24 @@ def make_env(
     stagger: bool = False,
     curriculum: bool = False,
     perturbation: PerturbationConfig | None = None,
+    randomise: RandomiseConfig | None = None,
 ) -> SoftArmEnv:
     """Build ``num_envs`` environments of one task; see ``SoftArmEnv`` for the arguments.
 
     ``curriculum``: for training alone, follow the task's if it is enabled; otherwise all scenes are the task's own.
     ``backend`` is a name that ``make_backend`` knows; None: the fused kernel of the device.
     """
-    own = {name: getattr(task_config, name) for name in SURFACE if getattr(task_config, name) is not None}
-    rod = make_backend(backend or default_backend(torch.device(device).type), replace(rod_parameters, **own))
+    rod = make_backend(backend or default_backend(torch.device(device).type), _surfaced(task_config, rod_parameters))
     if not curriculum:
         task_config = replace(task_config, curriculum=replace(task_config.curriculum, enabled=False))
-    return SoftArmEnv(make_task(task_config), rod, num_envs, seed, horizon, device, dtype, stagger, perturbation)
+    disturbed = (perturbation, randomise)
+    return SoftArmEnv(make_task(task_config), rod, num_envs, seed, horizon, device, dtype, stagger, *disturbed)
+
+
+def _surfaced(task_config: TaskConfig, parameters: RodParameters) -> RodParameters:
+    """Give the arm the surface that it has on a task."""
+    own = {name: getattr(task_config, name) for name in SURFACE if getattr(task_config, name) is not None}
+    return replace(parameters, **own)
 
 
 def _build(settings: Settings, num_envs: int, seed: int, horizon: int | None, training: bool) -> SoftArmEnv:
@@ -58,6 +66,7 @@ def _build(settings: Settings, num_envs: int, seed: int, horizon: int | None, tr
         stagger=training,
         curriculum=training,
         perturbation=settings.perturbation,
+        randomise=settings.randomise,
     )
 
 
@@ -72,6 +81,7 @@ def _check(settings: Settings) -> None:
     forks.check()  # before tensors are computed with
     config, rod = settings.task, settings.rod
     check_time_step(rod)
+    settings.randomise.check(_surfaced(config, rod))
     if config.n_agents >= rod.n_elements:
         raise ValueError(
             f"task.n_agents={config.n_agents} with rod.n_elements={rod.n_elements}: every section needs an inner node "

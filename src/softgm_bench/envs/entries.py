@@ -17,6 +17,7 @@ from tensordict import NestedKey, TensorDict
 from torch import Tensor
 
 from softgm_bench.envs.interface import Sizes
+from softgm_bench.rod.randomise import FACTORS
 
 Dimension = int | str
 
@@ -149,12 +150,15 @@ DIFFICULTY = _entry(
     "info", "difficulty", iteration=("difficulty", MEAN)
 )  # of the scene, 1: the task's; curriculum only
 
+# The episode's body: factors on the nominal arm's parameters, by name; only where bodies are drawn.
+BODY = {name: _entry("info", f"body_{name}", episode={f"body_{name}": LAST}) for name in FACTORS}
+
 REWARD_TERMS = "reward_terms"  # the paper's eight, by name
 REWARD_TERM_NAMES = ("distance", "progress", "smoothness", "time", "collision", "discovery", "stuck", "success")
 for _name in REWARD_TERM_NAMES:
     _entry(REWARD_TERMS, _name, episode={f"reward_{_name}": SUM}, iteration=(f"reward_{_name}", MEAN))
 
-OPTIONAL = (DIFFICULTY, CONTACT_FAILURE)
+OPTIONAL = (DIFFICULTY, CONTACT_FAILURE, *BODY.values())
 INFO = tuple(key for key in TABLE if key[0] == "info" and key not in OPTIONAL)
 EPISODE_COLUMNS = tuple(column for entry in TABLE.values() for column in entry.episode)
 ITERATION_COLUMNS = tuple(entry.iteration for entry in TABLE.values() if entry.iteration is not None)

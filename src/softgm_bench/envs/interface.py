@@ -77,6 +77,7 @@ class Settings(Protocol):
         task: a configuration that ``kind_of`` knows.
         rod: the arm's ``RodParameters``.
         perturbation: a ``PerturbationConfig``.
+        randomise: a ``RandomiseConfig``.
         device: ``cpu``, ``cuda`` or ``cuda:<index>``.
         backend: name of the rod's implementation; None: the device's fused kernel.
         dtype: ``float64`` or ``float32``, of the rod's state.
@@ -86,6 +87,7 @@ class Settings(Protocol):
     task: Any
     rod: Any
     perturbation: Any
+    randomise: Any
     device: str
     backend: str | None
     dtype: str

@@ -10,10 +10,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from tensordict import TensorClass, TensorDictBase
 from torch import Tensor
 
+from softgm_bench.envs import entries
 from softgm_bench.envs.curriculum import Progress, difficulty, first_progress, note_ends
 from softgm_bench.envs.perturbation import Perturbation, PerturbationConfig
 from softgm_bench.envs.sensing import Bins, Sight, SlotTable, bins_per_cylinder, cut_into_bins, empty_table, look
@@ -22,9 +24,11 @@ from softgm_bench.envs.verdict import Step, Verdict, judge
 from softgm_bench.rod import sync
 from softgm_bench.rod.actuation import DIRECTIONS, Actuation, control_points
 from softgm_bench.rod.backend import Backend
+from softgm_bench.rod.bodies import Bodies, draw, scales
 from softgm_bench.rod.contact_nodes import contact_nodes
 from softgm_bench.rod.divergence import diverged
 from softgm_bench.rod.parameters import rod_constants
+from softgm_bench.rod.randomise import FACTORS, RandomiseConfig
 from softgm_bench.rod.state import RodState, straight_rods
 from softgm_bench.upstream import graphs
 
@@ -45,6 +49,8 @@ class Episodes(TensorClass):
         terminated: success, divergence or too much contact, ``(num_envs,)`` bool.
         truncated: the horizon, ``(num_envs,)`` bool.
         difficulty: of the scene, from 0 to 1, the task's own, ``(num_envs,)`` float32.
+        body: factors on the arm's parameters in the order of ``FACTORS``, ``(num_envs, 6)`` float64; no columns where
+            all arms are the nominal one.
     """
 
     rod: RodState
@@ -58,6 +64,7 @@ class Episodes(TensorClass):
     terminated: Tensor
     truncated: Tensor
     difficulty: Tensor
+    body: Tensor
 
 
 class Simulation(TensorClass):
@@ -99,6 +106,7 @@ class Beginning(NamedTuple):
     previous_action: Tensor
     never: Tensor
     whole: Tensor
+    body: Tensor
 
 
 class Simulator:
@@ -109,6 +117,7 @@ class Simulator:
         task: what is drawn.
         backend: the rod's implementation.
         perturbation: what goes wrong; None: nothing.
+        randomise: from which ranges bodies are drawn; None: all arms are the nominal one.
         n_slots: obstacle slots, M.
         curriculum: whether scenes follow the task's curriculum.
     """
@@ -123,6 +132,7 @@ class Simulator:
         device: torch.device,
         dtype: torch.dtype,
         perturbation: PerturbationConfig | None,
+        randomise: RandomiseConfig | None = None,
     ) -> None:
         """Draw the first episodes; arguments as in ``SoftArmEnv``.
 
@@ -145,7 +155,9 @@ class Simulator:
         self._volume = torch.as_tensor(constants.volume, dtype=dtype, device=device)
         self._n_bins = task.max_cylinders * bins_per_cylinder(task.max_cylinder_length, config.bin_length)
         self._generator = torch.Generator(device=device)
-        self._generator.manual_seed(seed)
+        self.randomise = None if randomise is None or randomise.nothing else randomise
+        self._body_generator = torch.Generator(device=device)
+        self._seed_scenes(seed)
         self.perturbation: Perturbation | None = None
         if perturbation is not None and not perturbation.nothing:
             self.perturbation = Perturbation(perturbation, config.n_agents, seed, device)
@@ -165,20 +177,27 @@ class Simulator:
         other = copy.copy(self)
         other.state = self.state.clone()
         other._generator = copy.deepcopy(self._generator, memo)
+        other._body_generator = copy.deepcopy(self._body_generator, memo)
         other.perturbation = copy.deepcopy(self.perturbation, memo)
         return other
 
     # generators
 
     def seed(self, seed: int) -> None:
-        """Begin the random streams that belong to a seed: of scenes, and of what goes wrong."""
-        self._generator.manual_seed(seed)
+        """Begin the random streams that belong to a seed: of scenes, of bodies, and of what goes wrong."""
+        self._seed_scenes(seed)
         if self.perturbation is not None:
             self.perturbation.seed(seed)
 
+    def _seed_scenes(self, seed: int) -> None:
+        """Bodies have a stream of their own: scenes are the same with and without them."""
+        self._generator.manual_seed(seed)
+        self._body_generator.manual_seed(int(np.random.SeedSequence(seed, spawn_key=(4,)).generate_state(1)[0]))
+
     def generators(self) -> list[torch.Generator]:
-        """Give the generator of scenes and, with a perturbation, its own."""
-        return [self._generator, *([] if self.perturbation is None else [self.perturbation.generator])]
+        """Give the generator of scenes and those of a perturbation and of bodies, where there are any."""
+        more = [] if self.perturbation is None else [self.perturbation.generator]
+        return [self._generator, *more, *([] if self.randomise is None else [self._body_generator])]
 
     def load_state(self, state: TensorDictBase) -> None:
         """Take over a copy of ``state`` of as many environments of the same task."""
@@ -244,6 +263,7 @@ class Simulator:
         scene = self.task.sample(count, self._generator, level).apply(self._real)
         bins = self._cut(scene)
         blank = self._blank(count)
+        body = blank.body if self.randomise is None else draw(self.randomise, count, self._body_generator)
         episodes = Episodes(
             rod=blank.rod,
             scene=scene,
@@ -256,6 +276,7 @@ class Simulator:
             terminated=blank.never,
             truncated=blank.never,
             difficulty=blank.whole if level is None else level.to(torch.float32).expand(count),
+            body=body,
             batch_size=[count],
         )
         sight = self.sense(episodes)
@@ -275,6 +296,7 @@ class Simulator:
             ),
             never=torch.zeros(count, dtype=torch.bool, device=self.device),
             whole=torch.ones(count, dtype=torch.float32, device=self.device),
+            body=torch.ones((count, 0), dtype=torch.float64, device=self.device),
         )
         if not sync.is_free(self.device):
             self._beginnings[count] = blank
@@ -310,8 +332,11 @@ class Simulator:
         cylinders = now.scene.cylinders if self.task.max_cylinders else None
         velocity = self._move_cylinders(now, active) if self.task.moves else None
         couple = self._actuation.couple(action)
+        bodies = self._bodies(now)
+        if bodies is not None:
+            couple = couple * self._strength(now).to(self.dtype)[:, None, None]
         moved = self.backend.control_step(
-            rod, couple, force=force, cylinders=cylinders, active=active, cylinder_velocity=velocity
+            rod, couple, force=force, cylinders=cylinders, active=active, cylinder_velocity=velocity, bodies=bodies
         )
         broken = diverged(moved, self._rest_length, config.min_dilatation, config.max_dilatation)
         if sync.any_true(broken):
@@ -334,6 +359,10 @@ class Simulator:
             contact_steps=now.contact_steps,
         )
         verdict = judge(step, config, self.horizon)
+        if bodies is not None:
+            for key in (entries.TORQUE_PER_AGENT, entries.TORQUE_JOINT):  # which the verdict has of nominal sections
+                torque = verdict.numbers[key]
+                verdict.numbers[key] = torque * self._strength(now).to(torque.dtype).view_as(torque)
         now.steps, now.terminated, now.truncated = verdict.steps, verdict.terminated, verdict.truncated
         now.contact_steps = verdict.contact_steps
         if self.curriculum:
@@ -353,6 +382,14 @@ class Simulator:
 
     def _cut(self, scene: Scene) -> Bins:
         return cut_into_bins(scene.cylinders, self.task.config.bin_length, self.task.max_cylinder_length)
+
+    def _bodies(self, episodes: Episodes) -> Bodies | None:
+        """The factors on the rods' parameters; None: all are the nominal one."""
+        return None if self.randomise is None else Bodies(*episodes.body[:, : len(Bodies._fields)].unbind(-1))
+
+    def _strength(self, episodes: Episodes) -> Tensor:
+        """The factor on the sections' largest torque, ``(num_envs,)``, where bodies are drawn."""
+        return episodes.body[:, FACTORS.index("max_torque")]
 
     # readings
 
@@ -383,7 +420,11 @@ class Simulator:
         """Tell which nodes touch a cylinder, ``(num_envs, n_nodes)`` bool."""
         if not self.task.max_cylinders:
             return self._untouched(len(episodes.steps))
-        return contact_nodes(episodes.rod.position, self._volume, episodes.scene.cylinders)
+        volume, bodies = self._volume, self._bodies(episodes)
+        if bodies is not None:
+            own = scales(bodies, self.backend.parameters).volume
+            volume = own.to(self.dtype).unsqueeze(-1) * volume
+        return contact_nodes(episodes.rod.position, volume, episodes.scene.cylinders)
 
     def _untouched(self, count: int) -> Tensor:
         never = torch.zeros((), dtype=torch.bool, device=self.device)

@@ -19,6 +19,7 @@ from softgm_bench.envs.tasks.base import Scene, Task
 from softgm_bench.rod import sync
 from softgm_bench.rod.actuation import DIRECTIONS
 from softgm_bench.rod.backend import Backend
+from softgm_bench.rod.randomise import RandomiseConfig
 from softgm_bench.rod.state import RodState
 from softgm_bench.upstream import graphs
 
@@ -56,6 +57,7 @@ class SoftArmEnv(RememberingEnv):
         dtype: torch.dtype = torch.float64,
         stagger: bool = False,
         perturbation: PerturbationConfig | None = None,
+        randomise: RandomiseConfig | None = None,
     ) -> None:
         """Build the environments; the first ``reset`` draws their scenes.
 
@@ -71,6 +73,7 @@ class SoftArmEnv(RememberingEnv):
                 do not fall together and every batch of training holds all phases of an episode. The first scenes are
                 then not those of ``set_seed``: some were drawn while building, as in all trainings of before.
             perturbation: of observations, sections and tip, none by default.
+            randomise: ranges from which every episode's body is drawn; by default all arms are the nominal one.
 
         Raises:
             ValueError: the perturbation is of a section that does not exist.
@@ -80,7 +83,9 @@ class SoftArmEnv(RememberingEnv):
         self.sizes = sizes_of(task)
         self.task = task
         self._stagger = stagger
-        self.simulator = Simulator(task, backend, num_envs, seed, self.horizon, self.device, dtype, perturbation)
+        self.simulator = Simulator(
+            task, backend, num_envs, seed, self.horizon, self.device, dtype, perturbation, randomise
+        )
         if not stagger:
             self.simulator.seed(seed)  # a seed means the same scenes here as in ``set_seed``
         curriculum, perturbed = self.simulator.curriculum, self.simulator.perturbation is not None
@@ -93,6 +98,7 @@ class SoftArmEnv(RememberingEnv):
             curriculum=curriculum,
             perturbed=perturbed,
             contact_limit=self._limited,
+            bodies=self.simulator.randomise is not None,
         )
         for name, spec in specs.items():
             setattr(self, name, spec)
@@ -123,6 +129,11 @@ class SoftArmEnv(RememberingEnv):
     def tip_force(self) -> Tensor:
         """The force on the tip in the last step, N, ``(num_envs, 3)``."""
         return self.simulator.state.tip_force
+
+    @property
+    def body(self) -> Tensor:
+        """The factors of the episodes' bodies in the order of ``FACTORS``, ``(num_envs, 6)``; no columns if nominal."""
+        return self.simulator.state.episodes.body
 
     def contacts(self) -> Tensor:
         """Tell which nodes touch a cylinder, ``(num_envs, n_nodes)`` bool."""
@@ -201,6 +212,7 @@ class SoftArmEnv(RememberingEnv):
         numbers |= {entries.DISCOVERED: sight.table.count, entries.DROPPED: sight.table.dropped}
         if self.simulator.curriculum:
             numbers[entries.DIFFICULTY] = episodes.difficulty
+        numbers |= dict(zip(entries.BODY.values(), episodes.body.unbind(-1), strict=False))  # none if nominal
         position, at_agents = episodes.rod.position, self.simulator.at_agents
         own = (
             at_agents(position).to(torch.float32),
@@ -238,7 +250,7 @@ class SoftArmEnv(RememberingEnv):
     # checkpoints
 
     def generator_state(self) -> Tensor:
-        """Give the state of the generator that scenes are drawn from; with a perturbation, its own in a second row."""
+        """Give the state of the generator of scenes; in further rows those of a perturbation's and the bodies' own."""
         states = [generator.get_state() for generator in self.simulator.generators()]
         return states[0] if len(states) == 1 else torch.stack(states)
 

@@ -18,6 +18,7 @@ def make_specs(
     curriculum: bool = False,
     perturbed: bool = False,
     contact_limit: bool = False,
+    bodies: bool = False,
 ) -> dict[str, TensorSpec]:
     """Make the specs of the arm's environment, each with the batch dimension, by the name of ``EnvBase``'s attribute.
 
@@ -27,12 +28,14 @@ def make_specs(
         device: of all entries.
         curriculum: whether scenes have a difficulty; without one its entry is absent.
         contact_limit: whether contact can end an episode; without a limit its entry is absent.
+        bodies: whether episodes have bodies of their own; without them their entries are absent.
         perturbed: whether the previous action that agents observe may leave its bounds.
     """
     absent = {entries.ACTION, entries.REWARD, *ENDS}
     absent |= set() if sizes.n_privileged else {entries.PRIVILEGED}
     absent |= set() if curriculum else {entries.DIFFICULTY}
     absent |= set() if contact_limit else {entries.CONTACT_FAILURE}
+    absent |= set() if bodies else set(entries.BODY.values())
 
     def spec(key: NestedKey) -> TensorSpec:
         entry, shape = entries.TABLE[key], (num_envs, *entries.shape_of(key, sizes))

@@ -276,6 +276,8 @@ def _check(settings: Settings) -> None:
         raise ValueError(f"device={settings.device}: {task} runs on the CPU")
     if not settings.perturbation.nothing:
         raise ValueError(f"perturbation={settings.perturbation.name}: {task} has no arm; it must be none")
+    if not settings.randomise.nothing:
+        raise ValueError(f"randomise={settings.randomise.name}: {task} has no arm; it must be none")
     if settings.oracle:
         raise ValueError(f"observation=oracle: {task} has nothing that an oracle would be told")
 
