@@ -16,6 +16,7 @@ import torch
 
 from softgm_bench.envs import entries
 from softgm_bench.episodes import folder as evaluation_folder
+from softgm_bench.rod.randomise import FACTORS
 from softgm_bench.runs import checkpoint
 from softgm_bench.storage import archive
 
@@ -120,6 +121,23 @@ def test_episodes_are_the_same_with_a_perturbation_until_it_acts(run, tmp_path):
     assert columns(tmp_path / "early/episodes.csv") != same
 
 
+def test_episodes_tell_their_bodies_and_play_the_scenes_of_the_nominal_arm(run, tmp_path):
+    run(SOFTGM, *QUICK, "out=nominal")
+    status, out, _ = run(SOFTGM, *QUICK, "randomise=wide", "randomise.max_torque=[1,1]", "out=drawn")
+    assert status == 0
+    assert "softgm on basic, perturbation none, bodies wide, seed 0:" in out
+    nominal, drawn = (columns(tmp_path / name / "episodes.csv") for name in ("nominal", "drawn"))
+    assert set(drawn) - set(nominal) == {f"body_{name}" for name in FACTORS}
+    assert len(set(drawn["body_density"])) == 3
+    assert all(0.8 <= float(factor) <= 1.25 for factor in drawn["body_density"])
+    assert set(drawn["body_max_torque"]) == {"1.0"}
+    assert drawn["tip_travel_distance"] != nominal["tip_travel_distance"]
+    assert json.loads((tmp_path / "drawn/summary.json").read_text())["randomise"]["youngs_modulus"] == [0.5, 2.0]
+    assert run(SOFTGM, *QUICK, "out=drawn")[0] == 2  # the nominal arm's is another evaluation
+    run(SOFTGM, *QUICK, "randomise=wide", "randomise.max_torque=[1,1]", "out=again")
+    assert columns(tmp_path / "again/episodes.csv") == drawn
+
+
 def test_batches_make_as_many_episodes_and_no_two_alike(run, tmp_path):
     assert run(SOFTGM, *QUICK, "episodes=5", "batch=2", "out=x")[0] == 0
     assert len(set(columns(tmp_path / "x/episodes.csv")["final_distance"])) == 5
@@ -204,7 +222,14 @@ def test_an_evaluation_of_before_backends_were_told_is_known_again(run, tmp_path
 
 
 @pytest.mark.parametrize(
-    "other", [(MAPPO,), (SOFTGM, "episodes=4"), (SOFTGM, "horizon=5"), (SOFTGM, "perturbation=noise")]
+    "other",
+    [
+        (MAPPO,),
+        (SOFTGM, "episodes=4"),
+        (SOFTGM, "horizon=5"),
+        (SOFTGM, "perturbation=noise"),
+        (SOFTGM, "randomise=wide"),
+    ],
 )
 def test_another_policy_or_setting_is_another_evaluation(run, other):
     assert run(SOFTGM, *QUICK, "out=x")[0] == 0

@@ -90,6 +90,8 @@ def _certify(arguments: list[str]) -> None:
         raise UserError(f"task={config.task.name}: there is no arm in it")
     if TASKS[config.task.name].moves:
         raise UserError(f"task={config.task.name}: its obstacles move; scenes are certified where they stand still")
+    if not config.randomise.nothing:
+        raise UserError(f"randomise={config.randomise.name}: scenes are certified for the nominal arm; it must be none")
     path = Path(options.out or certified.FOLDER / f"{config.task.name}.npz")
     bench, judge = (Bench(config, options.episodes, options.seed, dtype) for dtype in ("float32", "float64"))
     search = Search(bench, judge, options.steps, options.seed)

@@ -25,6 +25,7 @@ Any other setting changes what is acted in, for all policies:
   task=wall                      any task; needed if all act at random. Single settings too, such as task.n_agents=8,
                                  rod.<key>, dtype, backend
   perturbation=noise             none, noise, section_failure or disturbance (conf/perturbation)
+  randomise=moderate             none, moderate or wide (conf/randomise): an arm of its own for every episode
 """
 
 import shlex

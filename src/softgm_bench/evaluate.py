@@ -27,6 +27,8 @@ Any other setting changes what the policy acts in:
                                  numba, torch (CPU), cuda and torch (GPU) are the same arm's implementations of ours
   perturbation=noise             none, noise, section_failure or disturbance (conf/perturbation)
   perturbation.tip_force=30      any single setting of it
+  randomise=moderate             none, moderate or wide (conf/randomise): an arm of its own for every episode
+  randomise.base_radius=[1,1]    any single range of it
 """
 
 import math
@@ -92,6 +94,8 @@ def _evaluate(arguments: list[str]) -> None:
     folder = Path(options.out or evaluation_folder.default_folder(source, trained, overrides, options.seed, unusual))
     under = trained.config.perturbation.name
     shown = f", intervention {intervention}" if intervention else ""
+    if not trained.config.randomise.nothing:
+        shown += f", bodies {trained.config.randomise.name}"
     if policy.backend_of(trained.config) == "pyelastica":
         shown += ", in PyElastica"
     title = f"{trained.label} on {trained.config.task.name}, perturbation {under}{shown}, seed {options.seed}:"

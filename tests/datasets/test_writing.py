@@ -72,7 +72,10 @@ def test_what_is_acted_in_must_be_the_same_but_a_later_version_may_have_more_set
     config = settings["config"]
     more = config | {"algo": None, "task": config["task"] | {"added": 0}}
     assert writing.begin(whole, settings | {"config": more})
-    for other in ({"dtype": "float32"}, {"task": config["task"] | {"success_radius": 0.1}}):
+    before = {key: value for key, value in config.items() if key != "randomise"}
+    assert writing._alike("config", {"config": before}, {"config": config})
+    bodies = {"randomise": config["randomise"] | {"name": "x", "density": [0.9, 1.1]}}
+    for other in ({"dtype": "float32"}, {"task": config["task"] | {"success_radius": 0.1}}, bodies):
         with pytest.raises(UserError, match="holds a data set with another config"):
             writing.begin(whole, settings | {"config": config | other})
 

@@ -12,6 +12,7 @@ from softgm_bench.certification.bench import way_left
 from softgm_bench.certification.search import run
 from softgm_bench.episodes import certified
 from softgm_bench.errors import UserError
+from softgm_bench.rod.randomise import RandomiseConfig
 
 FILES = sorted(certified.FOLDER.glob("*.npz"))
 SAMPLE = 20  # scenes of each file that are replayed in the quick tests
@@ -72,6 +73,8 @@ def test_no_scene_is_certified_where_the_physics_are_others():
     assert certified.mask(config("basic"), 500, 0, None, None) is None
     task = dataclasses.replace(settings.task, success_radius=0.04)
     assert certified.mask(dataclasses.replace(settings, task=task), 500, 0, None, None) is None
+    drawn = dataclasses.replace(settings, randomise=RandomiseConfig("x", density=(0.9, 1.1)))
+    assert certified.mask(drawn, 500, 0, None, None) is None
 
 
 def test_a_horizon_that_is_too_short_certifies_less():

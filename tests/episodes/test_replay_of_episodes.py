@@ -10,6 +10,7 @@ from recorded import WALL, recorded
 from softgm_bench.episodes import trajectory
 from softgm_bench.episodes.replay import compare, replay
 from softgm_bench.errors import UserError
+from softgm_bench.rod.randomise import FACTORS
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 SLIDING = ("task=wall_sliding", "task.wall_x=0.2", "task.slide_speed=0.2")  # the wall that the arm leans on soon
@@ -67,6 +68,25 @@ def test_a_perturbed_episode_has_its_bits_too(perturbation):
     assert one.tip_force.any() == ("disturbance" in perturbation[0])
     assert (one.action == 0).all(axis=(0, 2)).any() == ("failure" in perturbation[0])
     assert compare(one, replay(one, "numba"))["identical"]
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_an_episode_with_a_body_of_its_own_has_its_bits_too(dtype, tmp_path):
+    one = recorded(*WALL, "randomise=wide", f"dtype={dtype}")
+    trajectory.save(one, tmp_path / "episode.npz")
+    loaded = trajectory.load(tmp_path / "episode.npz")
+    assert set(loaded.body) == set(FACTORS)
+    assert loaded.body != recorded(*WALL, "randomise=moderate").body
+    assert loaded.arm.density == loaded.body["density"] * 1000.0
+    assert loaded.rod.density == 1000.0
+    np.testing.assert_allclose(loaded.radius()[0], 0.05 * loaded.body["base_radius"], rtol=1e-5)
+    assert one.contact.any()
+    assert compare(one, replay(loaded, "numba"))["identical"]
+    nominal = dataclasses.replace(loaded, info={key: value for key, value in loaded.info.items() if key != "body"})
+    assert nominal.body == {}
+    assert not compare(one, replay(nominal, "numba"))["identical"]
+    if dtype == "float64":
+        assert np.abs(replay(loaded, "pyelastica").position - one.position).max() < 1e-10
 
 
 def test_a_diverged_episode_has_its_bits_too():

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from softgm_bench.envs import entries
 from softgm_bench.envs.soft_arm import SoftArmEnv
+from softgm_bench.rod.randomise import FACTORS
 
 Array = NDArray[Any]
 RENDER_MODES = ("rgb_array",)
@@ -83,6 +84,7 @@ class Film:
         states = {name: np.stack(values) for name, values in self._states.items()}
         path = states.pop("starts")[:, exists].astype(float)
         bodies = {name: _first_row(getattr(cylinders, name))[exists].astype(float) for name in CYLINDER_FIELDS}
+        body = dict(zip(FACTORS, arm.body[0].tolist(), strict=False))  # empty if it is the nominal one
         steps = len(self._steps["reward"])
         shapes = {"action": (steps, arm.sizes.n_agents, arm.sizes.action), "tip_force": (steps, 3), "reward": (steps,)}
         return Trajectory(
@@ -96,7 +98,7 @@ class Film:
             success=bool(self._td[entries.SUCCESS]),
             diverged=bool(self._td[entries.DIVERGED]),
             config={"rod": asdict(arm.backend.parameters), "task": asdict(arm.task.config)},
-            info={},
+            info={"body": body} if body else {},
         )
 
 

@@ -26,7 +26,8 @@ from softgm_bench.envs.tasks import TASKS
 from softgm_bench.errors import UserError
 
 Array = NDArray[Any]
-SETTINGS = ("task", "rod", "perturbation", "device", "backend", "dtype")  # what an environment alone depends on
+# what an environment alone depends on
+SETTINGS = ("task", "rod", "perturbation", "randomise", "device", "backend", "dtype")
 
 
 def build_arm(

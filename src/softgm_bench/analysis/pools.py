@@ -13,7 +13,7 @@ ORACLE, CURRICULUM, PERTURBED, SMOKE = "†", "‡", "§", "¶"
 MARKS = {
     ORACLE: "actors were told what they would have to discover; whether they use it, interventions tell",
     CURRICULUM: "trained with easier scenes first; evaluated, as all are, on the task itself",
-    PERTURBED: "trained and evaluated under a perturbation",
+    PERTURBED: "trained and evaluated under a perturbation, or with a body drawn for every episode",
     SMOKE: "of smoke size: every part of a training once, which teaches nothing",
 }
 UNRANKED = {ORACLE, PERTURBED, SMOKE}
@@ -138,7 +138,7 @@ def by_algorithm(runs: Sequence[Run]) -> dict[tuple[str, str], list[Run]]:
 def pool_runs(runs: Sequence[Run]) -> dict[tuple[str, str], Pool]:
     """Pool final evaluations by task and algorithm; algorithms that differ in kind have different names.
 
-    Ranked are runs of more than smoke size, with the tuned recipe, without the oracle and trained without perturbation.
+    Ranked are runs of more than smoke size, with the tuned recipe, without the oracle, perturbation and drawn bodies.
     Where some of them were trained with a curriculum and others were not, those with it are not ranked.
     """
     pools = {}
@@ -154,7 +154,8 @@ def pool_runs(runs: Sequence[Run]) -> dict[tuple[str, str], Pool]:
 
 
 def _kinds(run: Run) -> set[str]:
-    there = {ORACLE: run.oracle, CURRICULUM: run.curriculum, PERTURBED: run.trained_with != "none", SMOKE: run.smoke}
+    perturbed = run.trained_with != "none" or run.randomised
+    there = {ORACLE: run.oracle, CURRICULUM: run.curriculum, PERTURBED: perturbed, SMOKE: run.smoke}
     return {mark for mark, is_so in there.items() if is_so}
 
 

@@ -103,6 +103,11 @@ class Run:
         return (self.config.get("perturbation") or {}).get("name", "none")
 
     @property
+    def randomised(self) -> bool:
+        """Tell whether training drew a body for every episode."""
+        return (self.config.get("randomise") or {}).get("name", "none") != "none"
+
+    @property
     def recipe(self) -> str:
         """Name of the hyperparameters."""
         return _recipe(self.config)

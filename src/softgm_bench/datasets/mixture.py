@@ -18,7 +18,8 @@ from softgm_bench.episodes import policy
 from softgm_bench.errors import UserError
 
 RANDOM = "random"  # in place of a policy's file
-ACTED_IN = ("task", "rod", "perturbation", "dtype", "backend")  # settings in which all of a data set's policies act
+# settings in which all of a data set's policies act
+ACTED_IN = ("task", "rod", "perturbation", "randomise", "dtype", "backend")
 OF_TRAINING = ("curriculum", "train_horizon")  # settings of a task that nothing but training heeds
 
 

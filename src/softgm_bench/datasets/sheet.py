@@ -84,7 +84,9 @@ def plain_bytes(folder: Path, sizes: Sizes) -> int:
 def settings_table(settings: Mapping[str, Any]) -> str:
     """Everything that decides what an episode is, as Markdown."""
     rows = ["| setting | value |", "| --- | --- |"]
-    for key in ("task", "rod", "perturbation", "dtype"):
+    for key in ("task", "rod", "perturbation", "randomise", "dtype"):
+        if key not in settings["config"]:
+            continue  # a data set of before bodies could be drawn
         rows += [f"| `{name}` | {value} |" for name, value in _single(key, settings["config"][key])]
     rows += [f"| `{key}` | {settings[key]} |" for key in ("backend", "device", "horizon")]
     return "\n".join(rows)

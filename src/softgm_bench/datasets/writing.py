@@ -194,7 +194,9 @@ def _alike(key: str, held: Mapping[str, Any], wanted: Mapping[str, Any]) -> bool
     """Tell whether a setting is the same; of the configuration what is acted in, since fingerprints tell policies."""
     if key != "config":
         return held.get(key) == wanted[key]
-    return all(_holds(held[key].get(name), wanted[key][name]) for name in ("task", "rod", "perturbation", "dtype"))
+    before = {"randomise": {"name": "none"}}  # data sets of before bodies could be drawn
+    names = ("task", "rod", "perturbation", "randomise", "dtype")
+    return all(_holds(held[key].get(name, before.get(name)), wanted[key][name]) for name in names)
 
 
 def _holds(held: Any, wanted: Any) -> bool:

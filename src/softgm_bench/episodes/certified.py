@@ -143,7 +143,7 @@ def mask(config: Config, episodes: int, seed: int, batch: int | None, horizon: i
 
     None where that says nothing: the task has no file, its physics are others, or no scene of the evaluation is known.
     """
-    known = of_task(config.task.name)
+    known = of_task(config.task.name) if config.randomise.nothing else None
     if known is None or config.mixed or config.device != "cpu" or known.physics != physics(build_env(config, 1, 0)):
         return None
     limit = horizon or config.task.horizon

@@ -36,7 +36,8 @@ def default_folder(
     changes = [f"{key.rpartition('.')[2]}-{value}" for key, _, value in named if key not in GROUPS]
     changes += [key if value is True else f"{key}-{value}" for key, value in unusual.items() if value]
     config = trained.config
-    name = "_".join([config.task.name, *changes, config.perturbation.name, f"seed{seed}"])
+    bodies = [] if config.randomise.name == "none" else [f"randomised-{config.randomise.name}"]
+    name = "_".join([config.task.name, *changes, config.perturbation.name, *bodies, f"seed{seed}"])
     name = re.sub(r"[^\w.-]+", "-", name)
     if source.is_dir():
         return source / "evaluations" / name
@@ -54,7 +55,7 @@ def same(folder: Path, trained: TrainedPolicy, episodes: int, settings: Mapping[
     """
     try:
         held = json.loads(RunFolder(folder).summary.read_text())
-        wanted = json.loads(to_json(_about(trained, settings)))
+        wanted = {"randomise": None} | json.loads(to_json(_about(trained, settings)))
         untold = {key: held.get(key, wanted[key]) for key in ("backend", "recipe")}
         known = {key: held.get(key) for key in wanted} | untold
         alike = known | {"threads": None} == wanted | {"threads": None} and held["metrics"]["episodes"] == episodes
@@ -97,6 +98,7 @@ def _about(trained: TrainedPolicy, settings: Mapping[str, Any]) -> dict[str, Any
         "frames": trained.frames,
         "policy": policy.fingerprint(trained),
         "perturbation": asdict(config.perturbation),
+        **({} if config.randomise.nothing else {"randomise": asdict(config.randomise)}),
         **settings,
     }
 

@@ -22,6 +22,7 @@ from softgm_bench.episodes.policy import TrainedPolicy
 from softgm_bench.episodes.trajectory import CYLINDER_FIELDS, PATH, ROD, Array, Trajectory
 from softgm_bench.errors import UserError
 from softgm_bench.rod.backend import default_backend, runs_on
+from softgm_bench.rod.randomise import FACTORS
 from softgm_bench.storage.versions import versions
 
 OBSERVED = (*entries.OBSERVATION, entries.PRIVILEGED)
@@ -77,6 +78,8 @@ def record(
         "backend": backend,
         "versions": versions(),
     }
+    if not config.randomise.nothing:
+        info["body"] = recorder.body
     simulated = plain(config) | {"rod": asdict(env.backend.parameters)}  # a task may have a surface of its own
     return recorder.trajectory(json.loads(json.dumps(simulated)), info)  # lists for tuples, as a file has them
 
@@ -124,9 +127,13 @@ class _Recorder:
         self.attention: dict[str, list[Array]] = {}
         self.path: list[Array] = []
         self.success = self.diverged = False
+        self.body: dict[str, float] = {}
 
     def state(self, data: TensorDictBase) -> None:
         """Note the arm as it is now and what the policy is shown of it."""
+        self.body = dict(
+            zip(FACTORS, self._own(self.env.body).tolist(), strict=False)
+        )  # empty if it is the nominal one
         rod = self.env.rod
         for name in ROD:
             self.states[name].append(self._own(getattr(rod, name)))

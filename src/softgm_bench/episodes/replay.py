@@ -12,6 +12,7 @@ from softgm_bench.episodes.trajectory import CYLINDER_FIELDS, PATH, ROD, Array, 
 from softgm_bench.errors import UserError
 from softgm_bench.rod import backend as rod_backend
 from softgm_bench.rod.actuation import Actuation
+from softgm_bench.rod.bodies import Bodies
 from softgm_bench.rod.divergence import diverged
 from softgm_bench.rod.parameters import rod_constants
 from softgm_bench.rod.pyelastica_backend import PyElasticaBackend
@@ -108,6 +109,7 @@ def _replayed(
     couple, force = _couple(trajectory, dtype), _force(trajectory)
     task = trajectory.config["task"]
     rest_length = torch.as_tensor(rod_constants(trajectory.rod).rest_length, dtype=dtype)
+    bodies = _bodies(trajectory)
     first = {name: torch.from_numpy(getattr(trajectory, name)[:1].copy()).to(dtype) for name in ROD}
     state = RodState(**first, batch_size=[1])
     states = [state]
@@ -116,7 +118,9 @@ def _replayed(
             watch()
         push = None if force is None else torch.from_numpy(force(step)).to(dtype).unsqueeze(0)
         cylinders, velocity = _cylinders(trajectory, step, dtype)
-        moved = backend.control_step(state, couple(step), force=push, cylinders=cylinders, cylinder_velocity=velocity)
+        moved = backend.control_step(
+            state, couple(step), force=push, cylinders=cylinders, cylinder_velocity=velocity, bodies=bodies
+        )
         if note is not None:
             note()
         # the environment keeps the last state of an arm whose simulation breaks
@@ -138,7 +142,20 @@ def _couple(trajectory: Trajectory, dtype: torch.dtype) -> Callable[[int], torch
         settings["scaling"],
         dtype=dtype,
     )
-    return lambda step: actuation.couple(torch.from_numpy(trajectory.action[step : step + 1]))
+    strength = trajectory.body.get("max_torque")
+
+    def couple(step: int) -> torch.Tensor:
+        values = actuation.couple(torch.from_numpy(trajectory.action[step : step + 1]))
+        return values if strength is None else values * strength
+
+    return couple
+
+
+def _bodies(trajectory: Trajectory) -> Bodies | None:
+    """The factors that made the episode's arm, ``(1,)`` each; None: it is the nominal one."""
+    if not trajectory.body:
+        return None
+    return Bodies(*(torch.tensor([trajectory.body[name]], dtype=torch.float64) for name in Bodies._fields))
 
 
 def _force(trajectory: Trajectory) -> Callable[[int], NDArray[np.float64]] | None:

@@ -50,7 +50,8 @@ class Trajectory:
         success: whether the tip reached the target.
         diverged: whether the simulation broke in the last step; its state is then that before the step.
         config: of the simulation and the policy, plain values.
-        info: label, task, frames, seed, episode, episodes, deterministic, backend, versions.
+        info: label, task, frames, seed, episode, episodes, deterministic, backend, versions; where bodies are drawn
+            also ``body``, the episode's factors on the nominal arm's parameters by name.
     """
 
     position: Array
@@ -117,9 +118,19 @@ class Trajectory:
 
     @cached_property
     def rod(self) -> RodParameters:
-        """The arm's physical parameters."""
+        """The nominal arm's physical parameters."""
         values = self.config["rod"]
         return RodParameters(**values | {"gravity": tuple(values["gravity"])})
+
+    @property
+    def body(self) -> dict[str, float]:
+        """The factors that made this episode's arm of the nominal one, by name; empty if it is that."""
+        return self.info.get("body", {})
+
+    @cached_property
+    def arm(self) -> RodParameters:
+        """The physical parameters of the arm that this episode had."""
+        return self.rod.times({name: factor for name, factor in self.body.items() if hasattr(self.rod, name)})
 
     @cached_property
     def agent_nodes(self) -> NDArray[np.int64]:
@@ -139,7 +150,7 @@ class Trajectory:
     def radius(self) -> NDArray[np.float64]:
         """Radius of every element, m, ``(T + 1, n_elements)``: an element keeps its volume when it is stretched."""
         length = np.linalg.norm(np.diff(self.position.astype(np.float64), axis=-1), axis=1)
-        return np.sqrt(rod_constants(self.rod).volume / (np.pi * length))
+        return np.sqrt(rod_constants(self.arm).volume / (np.pi * length))
 
 
 def save(trajectory: Trajectory, path: Path) -> None:

@@ -101,7 +101,7 @@ def payload(trajectory: Trajectory) -> dict[str, Any]:
         "agentNodes": [int(node) for node in trajectory.agent_nodes],
         "nodes": int(trajectory.position.shape[2]),
         "baseLength": rod["base_length"],
-        "baseRadius": rod["base_radius"],
+        "baseRadius": trajectory.arm.base_radius,
         "successRadius": task["success_radius"],
         "success": bool(trajectory.success),
         "diverged": bool(trajectory.diverged),

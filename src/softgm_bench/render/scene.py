@@ -98,7 +98,7 @@ class Stage:
         self._starts = [cylinders["start"]] if path is None else [path.min(axis=0), path.max(axis=0)]
         self.wall = len(self.edges) >= MANY
         self.first_seen = _first_seen(trajectory, self.bin_length)
-        lowest = [-0.2 * self.base_length, (self.position[:, 2] - rod["base_radius"]).min() - 0.02]
+        lowest = [-0.2 * self.base_length, (self.position[:, 2] - trajectory.arm.base_radius).min() - 0.02]
         feet = [z for start in self._starts for z in (*start[:, 2], *(start + self.edges)[:, 2])]
         self.floor = float(min([*lowest, *feet]))
         self.light = _light_frame(camera_azimuth)
