@@ -272,3 +272,39 @@ def test_what_is_said_of_a_mixture_of_sections_is_what_was_played():
         metrics = json.loads(played.read_text())["metrics"]
         rates = [metrics[f"success_rate_n{number}"] for number in (4, 6, 8)]
         assert row.split(" | ") == [f"{rate['mean']:.2f} [{rate['low']:.2f}, {rate['high']:.2f}]" for rate in rates]
+
+
+@pytest.fixture(scope="module")
+def bodies():
+    return script(ROOT / "experiments" / "bodies.py")
+
+
+def test_the_tables_of_drawn_bodies_are_made_from_the_committed_episodes(bodies):
+    page = bodies.PAGE.read_text()
+    assert bodies.page(page) == page
+
+
+def test_bodies_that_are_compared_played_the_same_scenes_with_the_same_policy(bodies):
+    told = ("backend", "overrides", "randomise", "metrics", "horizon")
+    for subject in bodies.POLICIES:
+        nominal = bodies.summary(subject, "none")
+        assert "randomise" not in nominal
+        for arguments in bodies.wanted():
+            if arguments[0] == subject:
+                summary = bodies.summary(*arguments)
+                assert summary.get("randomise", {"name": "none"})["name"] == arguments[1]
+                assert summary["backend"] == arguments[2]
+                assert {key: nominal[key] for key in nominal if key not in told} == {
+                    key: summary[key] for key in summary if key not in told
+                }
+
+
+def test_bodies_of_committed_evaluations_lie_in_their_ranges_and_belong_to_the_episodes_number(bodies):
+    drawn = [bodies.columns(subject, "wide") for subject in bodies.POLICIES]
+    for name in bodies.FACTORS:
+        low, high = bodies.summary("basic/softgm", "wide")["randomise"][name]
+        values = [one[f"body_{name}"] for one in drawn]
+        assert low - 1e-6 <= values[0].min() <= values[0].max() <= high + 1e-6
+        assert all(np.array_equal(values[0], other) for other in values)
+        moderate = bodies.columns("basic/softgm", "moderate")[f"body_{name}"]
+        assert name == "friction_coefficient" or np.array_equal(moderate.argsort(), values[0].argsort())
