@@ -162,6 +162,30 @@ def test_what_the_walls_recipe_reached_is_its_runs_own_final_evaluation(results)
     assert told in " ".join(results.PAGE.read_text().split())
 
 
+BUMPING = {  # rows of the page: the run whose curve it shows, and the evaluation whose contact it counts
+    "SoftGM": ("campaign/wall_touch/softgm/seed0", "evaluations/none"),
+    "SoftGM without stage 1": ("trials/wall_touch/no-stage-1", "evaluation-1600000"),
+}
+
+
+@pytest.mark.parametrize("name", BUMPING)
+def test_what_is_said_of_bumping_is_what_the_committed_curves_and_episodes_hold(name, results):
+    run, evaluation = BUMPING[name]
+    page = results.PAGE.read_text().partition("### A wall that has to be felt")[2].partition("## Earlier runs")[0]
+    curve, contact = (
+        [cell.strip() for cell in row.split("|")[2:-1]] for row in re.findall(rf"^\| {name}(?: \||,).*", page, re.M)
+    )
+    lines = [json.loads(line) for line in (ROOT / "experiments" / run / "evaluations.jsonl").read_text().splitlines()]
+    reached = {round(4 * line["frames"] / 1e6) / 4: f"{line['success_rate']['mean']:.2f}" for line in lines}
+    assert [cell for cell in curve if cell] == [
+        reached[frames] for frames in (0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0) if frames in reached
+    ]
+    with (ROOT / "experiments" / run / evaluation / "episodes.csv").open() as file:
+        episodes = list(csv.DictReader(file))
+    touched = np.array([int(row["contact_steps"]) if row["success"] == "True" else np.inf for row in episodes])
+    assert contact == [f"{(touched <= steps).mean():.2f}" for steps in (0, 1, 2, 3, 5, 10)]
+
+
 def folders_elsewhere(results):
     found = sorted(path.parent for path in results.SECTIONS.glob("*/*/*/summary.json"))
     assert len(found) >= 20
