@@ -59,7 +59,8 @@ def test_an_evaluation_leaves_its_episodes_and_a_summary_of_them(run, tmp_path):
     assert "success rate" in out
     assert {path.name for path in (tmp_path / "x").iterdir()} == {"episodes.csv", "summary.json"}
     found, summary = columns(tmp_path / "x/episodes.csv"), json.loads((tmp_path / "x/summary.json").read_text())
-    told = [column.name for column in entries.EPISODE_COLUMNS if column.key != entries.CONTACT_FAILURE]  # no limit here
+    absent = {entries.CONTACT_FAILURE, *entries.BODY.values()}  # no limit here, no body drawn
+    told = [column.name for column in entries.EPISODE_COLUMNS if column.key not in absent]
     assert list(found) == ["episode", *told]
     assert found["episode"] == ["0", "1", "2"]
     returns = np.array(found["undiscounted_return"], dtype=float)
@@ -274,7 +275,11 @@ MISTAKES = {
     ),
     "misspelt option": ([SOFTGM, "episode=3"], "episode: no such setting; did you mean episodes?"),
     "misspelt key": ([SOFTGM, "task.n_agent=3"], "task.n_agent: no such key; did you mean task.n_agents?"),
-    "wrong type": ([SOFTGM, "task.n_agents=six"], "task.n_agents: Value 'six' of type 'str' could not be converted"),
+    "wrong type": ([SOFTGM, "task.horizon=six"], "task.horizon: Value 'six' of type 'str' could not be converted"),
+    "no number": (
+        [SOFTGM, "task.n_agents=six"],
+        "task.n_agents is six: it must be a whole number, or a list of several",
+    ),
     "no agents": ([SOFTGM, "task.n_agents=0"], "task.n_agents is 0: it must be at least 1"),
     "no such agent": (
         [SOFTGM, "perturbation=section_failure", "task.n_agents=2"],
