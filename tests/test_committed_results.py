@@ -164,7 +164,7 @@ def test_what_the_walls_recipe_reached_is_its_runs_own_final_evaluation(results)
 
 BUMPING = {  # rows of the page: the run whose curve it shows, and the evaluation whose contact it counts
     "SoftGM": ("campaign/wall_touch/softgm/seed0", "evaluations/none"),
-    "SoftGM without stage 1": ("trials/wall_touch/no-stage-1", "evaluation-1600000"),
+    "SoftGM without stage 1": ("campaign/wall_touch/softgm_no_stage1/seed0", "evaluations/none"),
 }
 
 
