@@ -84,14 +84,14 @@ def run_table() -> str:
     """Every finished cell as a row of a Markdown table."""
     lines = [RUNS, "|" + " --- |" * (RUNS.count("|") - 1)]
     for run in runs().values():
-        summary, result = run.summary, run.summary["final_evaluation"]
+        result = run.summary["final_evaluation"]
         success, torque = result["success_rate"], result["torque_joint"]
         cells = (
             f"`{run.final.task}`",
             run.final.label,
             f"{run.final.seed}",
             f"{run.final.frames:,}",
-            f"{summary['wall_time'] / 60:.0f}",
+            f"{run.minutes:.0f}",
             f"{success['mean']:.3f}",
             f"[{success['low']:.3f}, {success['high']:.3f}]",
             f"{result['episodes']}",

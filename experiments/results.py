@@ -85,7 +85,7 @@ def table(task: str) -> str:
             summary["algo"],
             str(summary["seed"]),
             f"{summary['frames']:,}",
-            f"{summary['wall_time'] / 60:.0f}",
+            f"{run.minutes:.0f}",
             str(summary["threads"]),
             f"{success['mean']:.3f}",
             f"[{success['low']:.3f}, {success['high']:.3f}]",

@@ -3,11 +3,11 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numba
 import pytest
 import torch
 from torchrl.envs.utils import step_mdp
 
+from kept_threads import kept_threads
 from softgm_bench import api
 from softgm_bench.envs import entries
 from softgm_bench.errors import UserError
@@ -30,10 +30,8 @@ TINY = (
 
 @pytest.fixture(autouse=True, scope="module")
 def _threads_as_before():
-    before = torch.get_num_threads(), numba.get_num_threads()
-    yield
-    torch.set_num_threads(before[0])
-    numba.set_num_threads(before[1])
+    with kept_threads():
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -2,11 +2,10 @@
 
 import pytest
 import torch
-from test_round_trips import Standing, actions, leaves
+from test_round_trips import actions, leaves, stepped
 from torchrl.envs.utils import check_env_specs
 
 from dense import force_dense
-from round_trips import RoundTrips
 from softgm_bench.envs import entries, make_env
 from softgm_bench.envs.tasks import TASK_CONFIGS
 from softgm_bench.rod.bodies import Bodies, scales
@@ -121,15 +120,8 @@ def test_a_checkpoint_of_before_there_were_bodies_is_read(build):
 
 
 def test_neither_steps_nor_resets_wait_for_a_device(build):
-    env = build("wide", horizon=3, stagger=True)
-    env.simulator.backend = Standing(env.backend.parameters)
-    td = env.reset()
-    with force_dense():
-        env.step_and_maybe_reset(td.clone().set(entries.ACTION, actions(env, 1)[0]))  # constants are copied once
-        with RoundTrips() as trips:
-            for action in actions(env, 6):
-                _, td = env.step_and_maybe_reset(td.set(entries.ACTION, action))
-    assert trips.found == []
+    found, _ = stepped(build("wide", horizon=3, stagger=True))
+    assert found == []
 
 
 def test_the_torque_limit_is_on_the_arm_and_in_the_metrics(build):

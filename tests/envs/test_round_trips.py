@@ -40,9 +40,8 @@ def leaves(td):
     return dict(td.items(include_nested=True, leaves_only=True))
 
 
-@pytest.mark.parametrize("task", TASKS)
-def test_neither_steps_nor_resets_wait_for_a_device(build, task):
-    env = build(task, horizon=3, stagger=True)
+def stepped(env):
+    """What six steps, and the resets among them, wait for on another device's way, and the last frame."""
     env.simulator.backend = Standing(env.backend.parameters)
     td = env.reset()
     with force_dense():
@@ -50,7 +49,13 @@ def test_neither_steps_nor_resets_wait_for_a_device(build, task):
         with RoundTrips() as trips:
             for action in actions(env, 6):
                 _, td = env.step_and_maybe_reset(td.set(entries.ACTION, action))
-    assert trips.found == []
+    return trips.found, td
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_neither_steps_nor_resets_wait_for_a_device(build, task):
+    found, td = stepped(build(task, horizon=3, stagger=True))
+    assert found == []
     assert not td["done"].any()  # the horizon has come by, so there were resets
 
 

@@ -3,11 +3,11 @@
 import json
 import sys
 
-import numba
 import pytest
 import torch
 from interrupted import PPO, SMALL, TINY
 
+from kept_threads import kept_threads
 from softgm_bench import status
 from softgm_bench.algorithms.ppo import PPO as Algorithm
 from softgm_bench.analysis.runs import find
@@ -33,10 +33,8 @@ CHECKPOINT_FRAMES, POISONED = 64, 5  # of SMALL: 16 frames an iteration, a check
 
 @pytest.fixture(autouse=True)
 def _threads_as_before():
-    before = torch.get_num_threads(), numba.get_num_threads()
-    yield
-    torch.set_num_threads(before[0])
-    numba.set_num_threads(before[1])
+    with kept_threads():
+        yield
 
 
 def refusal(folder, *overrides):

@@ -4,13 +4,13 @@ import csv
 import json
 import re
 
-import numba
 import numpy as np
 import pytest
 import torch
 from interrupted import SMALL, state, written
 from tensordict import TensorDict
 
+from kept_threads import kept_threads
 from softgm_bench import api
 from softgm_bench.assembly import configure
 from softgm_bench.config import compose
@@ -27,10 +27,8 @@ EASY = ("task.success_radius=0.9", "experiment.evaluation.final_episodes=7")
 
 @pytest.fixture(autouse=True, scope="module")
 def _threads_as_before():
-    before = torch.get_num_threads(), numba.get_num_threads()
-    yield
-    torch.set_num_threads(before[0])
-    numba.set_num_threads(before[1])
+    with kept_threads():
+        yield
 
 
 def train(folder, *overrides):

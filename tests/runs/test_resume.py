@@ -10,11 +10,11 @@ import subprocess
 import sys
 import time
 
-import numba
 import pytest
 import torch
 from interrupted import PPO, SMALL, TINY, differences, start, state, written
 
+from kept_threads import kept_threads
 from softgm_bench.config import compose
 from softgm_bench.errors import UserError
 from softgm_bench.runs import checkpoint, ending, loop
@@ -81,10 +81,8 @@ class Death(BaseException):
 
 @pytest.fixture(autouse=True)
 def _threads_as_before():
-    before = torch.get_num_threads(), numba.get_num_threads()
-    yield
-    torch.set_num_threads(before[0])
-    numba.set_num_threads(before[1])
+    with kept_threads():
+        yield
 
 
 def train(folder, *overrides):

@@ -354,7 +354,7 @@ def sources(runs: Sequence[Run]) -> Table:
     columns = [*SOURCE, *_numbers("frames", "minutes"), *RESULT, *_numbers("time limit"), *_texts("source")]
     rows: list[Row] = []
     for run in runs:
-        amounts = [f"{run.final.frames:,}", f"{run.summary['wall_time'] / 60:.0f}"]
+        amounts = [f"{run.final.frames:,}", f"{run.minutes:.0f}"]
         limit, folder = f"{run.final.horizon:,}", Cell(run.final.folder, muted=True)
         rows.append([*_source(run.final), *amounts, *_result(run.final), limit, folder])
     caption = "Every run that the tables and figures hold, with Wilson's 95 % interval over its episodes."

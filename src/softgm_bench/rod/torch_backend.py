@@ -9,17 +9,17 @@ import math
 from collections.abc import Callable
 from functools import partial
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from softgm_bench.rod.bodies import Bodies, scales
 from softgm_bench.rod.contact import contact_forces, element_length, element_radius
 from softgm_bench.rod.exact_contact import exact_contact_forces
 from softgm_bench.rod.parameters import RodParameters, rod_constants
+from softgm_bench.rod.recomputation import Recomputed
 from softgm_bench.rod.state import Cylinders, RodState, check_inputs
 
 _CONTACT_FORCES = {"pyelastica": contact_forces, "exact": exact_contact_forces}
@@ -258,36 +258,6 @@ class TorchBackend:
         return self._tensors[key]
 
 
-class _Recomputed(torch.autograd.Function):
-    """A function of tensors whose intermediate values are computed again in the backward pass rather than kept.
-
-    ``torch.utils.checkpoint`` does the same through hooks on every saved tensor, which for a rod of this size cost
-    more than the arithmetic.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, run: Callable[..., tuple[Tensor, ...]], *inputs: Tensor) -> tuple[Tensor, ...]:
-        ctx.run = run
-        ctx.save_for_backward(*inputs)
-        return tuple(run(*inputs))
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        needed = ctx.needs_input_grad[1:]
-        inputs = [x.detach().requires_grad_(need) for x, need in zip(ctx.saved_tensors, needed, strict=True)]
-        with torch.enable_grad():
-            outputs = ctx.run(*inputs)
-        used = [(output, gradient) for output, gradient in zip(outputs, gradients, strict=True) if output.requires_grad]
-        wanted = [x for x in inputs if x.requires_grad]
-        found = iter(
-            torch.autograd.grad(
-                [output for output, _ in used], wanted, [gradient for _, gradient in used], allow_unused=True
-            )
-        )
-        return (None, *(next(found) if need else None for need in needed))
-
-
 def _obstacles(cylinders: Cylinders | None, velocity: Tensor | None) -> Obstacles | None:
     if cylinders is None or velocity is None:
         return None if cylinders is None else Obstacles(cylinders, None)
@@ -303,7 +273,7 @@ def _recomputed(
     obstacles: Obstacles | None,
     bodies: Bodies | None,
 ) -> Motion:
-    """``segment`` of the other arguments with gradients for each of them, through ``_Recomputed``."""
+    """``segment`` of the other arguments with gradients for each of them, through ``Recomputed``."""
     shapes: tuple[Tensor, ...] = ()
     if obstacles is not None:
         cylinders, velocity = obstacles
@@ -319,7 +289,7 @@ def _recomputed(
         motion = Motion(position, director, moving, omega)
         return segment(motion, couple, force, seen, Bodies(*factors) if factors else None)
 
-    return Motion(*_Recomputed.apply(run, *motion, couple, force, *shapes, *(bodies or ())))
+    return Motion(*Recomputed.apply(run, *motion, couple, force, *shapes, *(bodies or ())))
 
 
 def kinematic_step(motion: Motion, duration: float) -> Motion:

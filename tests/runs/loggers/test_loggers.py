@@ -6,10 +6,10 @@ import subprocess
 import sys
 import time
 
-import numba
 import pytest
 import torch
 
+from kept_threads import kept_threads
 from softgm_bench.config import compose
 from softgm_bench.errors import UserError
 from softgm_bench.runs.loggers import guarded
@@ -35,10 +35,8 @@ TIMINGS = ("wall_time", "frames_per_second")
 
 @pytest.fixture(autouse=True, scope="module")
 def _threads_as_before():
-    before = torch.get_num_threads(), numba.get_num_threads()
-    yield
-    torch.set_num_threads(before[0])
-    numba.set_num_threads(before[1])
+    with kept_threads():
+        yield
 
 
 def rows(path):
