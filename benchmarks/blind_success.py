@@ -25,7 +25,7 @@ from softgm_bench.config import compose
 from softgm_bench.envs.tasks import make_task
 from softgm_bench.envs.tasks.wall import Wall
 
-TASKS = ("wall", "wall_touch", "wall_search", "wall_decoy")
+TASKS = ("wall", "wall_touch", "wall_sense", "wall_search", "wall_decoy")
 TRIES = (1, 2, 6)
 CLEARANCE = 0.05  # m, the arm's radius
 STEP = 0.01  # m, between two candidates

@@ -58,7 +58,7 @@ def test_the_page_has_the_figures():
         assert "| " + " | ".join([f"`{row['task']}`", *shares, *explained]) + " |" in PAGE
 
 
-@pytest.mark.parametrize("name", ["wall", "wall_touch", "wall_search", "wall_decoy"])
+@pytest.mark.parametrize("name", ["wall", "wall_touch", "wall_sense", "wall_search", "wall_decoy"])
 def test_the_page_has_the_number_of_certified_scenes(name):
     known = certified.of_task(name)
     row = re.search(rf"\| `{name}` \| (\d+) \| (\d+) \| (\d+) \|", PAGE)

@@ -23,7 +23,7 @@ def test_values_of_the_wrong_type_are_refused():
 
 
 def test_unknown_choices_list_the_known_ones():
-    walls = "wall, wall_decoy, wall_fixed, wall_narrow, wall_search, wall_sliding, wall_touch"
+    walls = "wall, wall_decoy, wall_fixed, wall_narrow, wall_search, wall_sense, wall_sliding, wall_touch"
     tasks = f"basic, structured, swinging_posts, vmas_balance, vmas_navigation, {walls}"
     assert refusal("task=wal") == f"task=wal: no such task; choose one of {tasks}"
     assert refusal("experiment=fast") == "experiment=fast: no such experiment; choose one of default, gpu, quick, smoke"

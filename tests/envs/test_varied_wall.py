@@ -9,7 +9,7 @@ import torch
 from softgm_bench.envs.tasks import make_task
 from softgm_bench.rod.contact_nodes import point_segment_distance
 
-NAMES = ("wall_touch", "wall_search", "wall_decoy")
+NAMES = ("wall_touch", "wall_sense", "wall_search", "wall_decoy")
 COUNT = 2000
 
 

@@ -18,7 +18,7 @@ from softgm_bench.runs import checkpoint
 from softgm_bench.runs.loop import train
 from softgm_bench.storage.run_folder import RunFolder
 
-FELT = ("wall_touch", "wall_search", "wall_decoy")  # walls that have to be felt
+FELT = ("wall_touch", "wall_sense", "wall_search", "wall_decoy")  # walls that have to be felt
 TASKS = tuple(task for task in every_task.TASKS if task not in FELT)
 ALGORITHMS = tuple(algorithm_configs())
 ON_POLICY = ("softgm", "ippo", "mappo")

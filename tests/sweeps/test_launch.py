@@ -85,13 +85,13 @@ def test_named_grids_have_the_papers_cells_and_share_those_that_are_the_same(siz
 
 
 def test_the_ladder_goes_from_blind_to_told_and_shares_the_wholes_runs():
-    assert len(sweep.cells(["+grids=ladder"])[0]) == 27
+    assert len(sweep.cells(["+grids=ladder"])[0]) == 36
     rungs = [str(cell.run_dir) for cell in sweep.cells(["+grids=ladder", "seed=1", "task=wall"])[0]]
     assert rungs == [f"outputs/full/wall/{name}/seed1" for name in ("softgm_no_stage1", "softgm", "softgm_remember")]
     told, _ = sweep.cells(["+grids=ladder", "seed=1", "task=wall", "model=softgm", "observation=oracle"])
     assert [str(cell.run_dir) for cell in told] == ["outputs/full/wall/softgm_oracle/seed1"]
     recurrent, _ = sweep.cells(["+grids=ladder", "seed=1", "model=softgm", "algo.actor.memory={cell:gru,size:128}"])
-    tasks = ("wall", "wall_touch", "wall_decoy")
+    tasks = ("wall", "wall_touch", "wall_sense", "wall_decoy")
     assert [str(cell.run_dir) for cell in recurrent] == [f"outputs/full/{task}/softgm_gru/seed1" for task in tasks]
 
 
@@ -99,7 +99,7 @@ def test_the_ladder_goes_from_blind_to_told_and_shares_the_wholes_runs():
 def test_the_rivals_differ_in_the_model_alone_and_share_softgms_runs_with_the_ladder(size):
     cells = sweep.cells([f"+grids=rivals{size}"])[0]
     assert len(cells) == 27
-    names = [str(cell.run_dir.parent.name) for cell in cells if "wall_touch" in str(cell.run_dir)]
+    names = [str(cell.run_dir.parent.name) for cell in cells if "wall_sense" in str(cell.run_dir)]
     assert sorted(set(names)) == ["softgm", "softgm_informarl", "softgm_section_transformer"]
     if not size:
         softgm = {cell.run_dir for cell in cells if cell.run_dir.parent.name == "softgm"}

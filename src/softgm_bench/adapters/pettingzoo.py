@@ -46,7 +46,7 @@ def parallel_env(
 
     Args:
         task: ``basic``, ``structured``, ``wall``, ``wall_narrow``, ``wall_fixed``, ``wall_touch``, ``wall_search``,
-            ``wall_decoy``, ``wall_sliding`` or ``swinging_posts``.
+            ``wall_decoy``, ``wall_sense``, ``wall_sliding`` or ``swinging_posts``.
         seed: of the scenes until ``reset(seed=...)`` gives another; None: from the operating system.
         render_mode: ``rgb_array`` or None.
         horizon: control steps until truncation, the task's by default.

@@ -1,4 +1,4 @@
-"""``wall_touch``, ``wall_search``, ``wall_decoy``: walls whose targets say nothing about the opening."""
+"""``wall_touch``, ``wall_sense``, ``wall_search``, ``wall_decoy``: their targets say nothing about the opening."""
 
 import math
 from dataclasses import dataclass
@@ -56,7 +56,7 @@ class VariedWallConfig(WallConfig):
         return self.curriculum.easy_opening_side if self.curriculum.enabled else self.opening_side
 
 
-@register_task("wall_touch", "wall_search", "wall_decoy")
+@register_task("wall_touch", "wall_sense", "wall_search", "wall_decoy")
 class VariedWall(Wall):
     """As ``Wall``, but target and opening are independent: neither is drawn with a look at the other.
 
