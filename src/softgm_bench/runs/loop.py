@@ -24,7 +24,7 @@ from softgm_bench.runs.budget import Budget
 from softgm_bench.runs.interruption import Interrupted, Interruption
 from softgm_bench.runs.loggers.guarded import Loggers, refuse_missing
 from softgm_bench.runs.loggers.video import episode_video
-from softgm_bench.runs.machine import keep_memory, set_matmul, set_threads
+from softgm_bench.runs.machine import give_back_memory, keep_memory, set_matmul, set_threads
 from softgm_bench.runs.metrics import CsvWriter, EpisodeTracker, of_team, step_metrics, success_by_number
 from softgm_bench.runs.progress import Progress
 from softgm_bench.runs.run import Run, derive_seeds, frames_per_iteration, total_frames
@@ -168,6 +168,7 @@ def _learn(run: Run, interruption: Interruption, progress: Progress) -> None:
             _evaluate_if_due(run, interruption, progress)
             if _crossed(experiment.checkpoint.interval, run.frames, frames):
                 _save(run)
+                give_back_memory()
             began = time.perf_counter()
 
 
