@@ -10,7 +10,7 @@ know the plane: a bound from above. At a dead end a try is lost.
 
 The second table says how much of the opening the target tells: the coefficient of determination of its place along the
 wall and of its height on held-out scenes, by a linear fit and by the mean of the nearest 50 of the scenes. ``wall``
-redraws target and opening together until the way through is short enough; the other three draw them independently.
+redraws target and opening together until the way through is short enough; the others draw them independently.
 """
 
 import argparse
@@ -25,7 +25,7 @@ from softgm_bench.config import compose
 from softgm_bench.envs.tasks import make_task
 from softgm_bench.envs.tasks.wall import Wall
 
-TASKS = ("wall", "wall_touch", "wall_sense", "wall_search", "wall_decoy")
+TASKS = ("wall", "wall_touch", "wall_search", "wall_decoy", "wall_sense")
 TRIES = (1, 2, 6)
 CLEARANCE = 0.05  # m, the arm's radius
 STEP = 0.01  # m, between two candidates

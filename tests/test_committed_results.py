@@ -171,7 +171,7 @@ BUMPING = {  # rows of the page: the run whose curve it shows, and the evaluatio
 @pytest.mark.parametrize("name", BUMPING)
 def test_what_is_said_of_bumping_is_what_the_committed_curves_and_episodes_hold(name, results):
     run, evaluation = BUMPING[name]
-    page = results.PAGE.read_text().partition("### A wall that has to be felt")[2].partition("## Earlier runs")[0]
+    page = results.PAGE.read_text().partition("### A wall that has to be felt")[2].partition("\n### ")[0]
     curve, contact = (
         [cell.strip() for cell in row.split("|")[2:-1]] for row in re.findall(rf"^\| {name}(?: \||,).*", page, re.M)
     )
@@ -184,6 +184,35 @@ def test_what_is_said_of_bumping_is_what_the_committed_curves_and_episodes_hold(
         episodes = list(csv.DictReader(file))
     touched = np.array([int(row["contact_steps"]) if row["success"] == "True" else np.inf for row in episodes])
     assert contact == [f"{(touched <= steps).mean():.2f}" for steps in (0, 1, 2, 3, 5, 10)]
+
+
+KNOWING = {  # rows of the page: the trial whose curve each shows
+    "whole, sensing from 0.15 m": "wall_touch/contact-2_fail-40",
+    "without stage 1": "wall_touch/contact-2_fail-40_no-stage1",
+    "whole, sensing from 0.25 m": "wall_touch/contact-2_fail-40_sense-0.25",
+    "without stage 1, rewarded for what is discovered from 0.25 m": "wall_touch/contact-2_fail-40_sense-0.25_no-stage1",
+    "without stage 1, told where the opening is": "wall_touch/contact-2_fail-40_sense-0.25_oracle",
+    "without stage 1, told which": "wall_decoy/closed_contact-5_sense-0.25_oracle",
+}
+
+
+@pytest.mark.parametrize("name", KNOWING)
+def test_what_is_said_of_knowing_is_what_the_trials_hold(name, results):
+    folder = ROOT / "experiments/trials" / KNOWING[name]
+    page = results.PAGE.read_text().partition("### To know is not yet to pass")[2].partition("\n##")[0]
+    row = re.search(rf"^\| {re.escape(name)} \|(.*)\|$", page, re.MULTILINE)[1]
+    lines = [json.loads(line) for line in (folder / "evaluations.jsonl").read_text().splitlines()]
+    assert [cell.strip() for cell in row.split("|") if cell.strip()] == [
+        f"{line['success_rate']['mean']:.2f}" for line in lines
+    ]
+    if "told" in name:
+        scenes = [results.episodes_in(folder / "evaluations")[shown]["success"] for shown in ("none", "swap_opening")]
+        split = mcnemar(*scenes)
+        own, others = (f"{scene.mean():.3f}" for scene in scenes)
+        told = " ".join(page.split())
+        assert f"{others} of 256 scenes instead of {own} ({split.lost} lost, {split.won} won" in told or (
+            f"{others} instead of {own} of 256 scenes ({split.lost} lost, {split.won} won" in told
+        )
 
 
 def folders_elsewhere(results):

@@ -71,6 +71,10 @@ def test_the_opening_is_free_and_the_rest_of_the_wall_is_closed(draw, name):
     at = (scene.privileged[:, 1:2] + along).abs() < 0.5  # on the wall
     if c.dead_end is None:
         assert blocked[:, outer][at[:, outer]].all()
+    elif c.dead_end < c.column_radius:  # columns stand in the other hole; between them is no room for an arm
+        tight = ((distance < cylinders.radius.unsqueeze(2) + 0.05) & cylinders.mask.unsqueeze(2)).any(dim=1)
+        assert tight[:, outer][at[:, outer]].all()
+        assert not tight[:, (along.abs() < 0.25 * side) & (height.abs() < 0.25 * side)].any()
     else:  # there is one more hole, with columns behind it
         assert (~blocked & outer & at).any(dim=1).all()
 
