@@ -13,6 +13,7 @@ sys.path.insert(0, str(ROOT / "benchmarks"))
 
 import blind_success  # noqa: E402
 
+from every_task import FELT  # noqa: E402
 from softgm_bench.config import compose  # noqa: E402
 from softgm_bench.envs.tasks import make_task  # noqa: E402
 from softgm_bench.episodes import certified  # noqa: E402
@@ -58,7 +59,7 @@ def test_the_page_has_the_figures():
         assert "| " + " | ".join([f"`{row['task']}`", *shares, *explained]) + " |" in PAGE
 
 
-@pytest.mark.parametrize("name", ["wall", "wall_touch", "wall_sense", "wall_search", "wall_decoy"])
+@pytest.mark.parametrize("name", ["wall", *FELT])
 def test_the_page_has_the_number_of_certified_scenes(name):
     known = certified.of_task(name)
     row = re.search(rf"\| `{name}` \| (\d+) \| (\d+) \| (\d+) \|", PAGE)

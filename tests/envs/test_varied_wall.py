@@ -6,10 +6,10 @@ import math
 import pytest
 import torch
 
+from every_task import FELT
 from softgm_bench.envs.tasks import make_task
 from softgm_bench.rod.contact_nodes import point_segment_distance
 
-NAMES = ("wall_touch", "wall_sense", "wall_search", "wall_decoy")
 COUNT = 2000
 
 
@@ -30,7 +30,7 @@ def in_wall(scene, points):
     return y * yaw.cos() - x * yaw.sin(), x * yaw.cos() + y * yaw.sin(), z
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", FELT)
 def test_the_target_says_nothing_about_the_opening(draw, name):
     _, scene = draw(name)
     opening, target = scene.privileged[:, 1:3], scene.target
@@ -41,7 +41,7 @@ def test_the_target_says_nothing_about_the_opening(draw, name):
     assert (explained < 0.02).all()  # 9 numbers fitted to 2000 values of chance explain 0.005
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", FELT)
 def test_every_target_of_the_box_can_be_reached_through_every_opening(draw, name):
     task, scene = draw(name)
     opening, other = scene.privileged[:, :3], scene.target.roll(1, dims=0)
@@ -50,7 +50,7 @@ def test_every_target_of_the_box_can_be_reached_through_every_opening(draw, name
     assert way.max() > 0.9 * task.config.max_path
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", FELT)
 def test_the_opening_is_free_and_the_rest_of_the_wall_is_closed(draw, name):
     task, scene = draw(name, 300)
     c, side = task.config, task.config.opening_side
@@ -126,7 +126,7 @@ def test_the_dead_end_is_on_either_side_and_closed_on_all_sides(draw):
 
 
 def test_scenes_get_easier_with_less_difficulty_and_are_the_tasks_own_at_one(settings):
-    for name in NAMES:
+    for name in FELT:
         task = make_task(settings(f"task={name}", "task.curriculum.enabled=true").task)
 
         def scenes(difficulty, task=task):

@@ -48,8 +48,8 @@ def set_matmul(precision: str | None) -> None:
 
 def keep_memory() -> None:
     """Let glibc keep freed memory: tensors of a megabyte would otherwise be mapped anew, page by page, at every use."""
-    if platform.libc_ver()[0] == "glibc":
-        libc = ctypes.CDLL(None)
+    libc = _glibc()
+    if libc is not None:
         libc.mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
         libc.mallopt(M_MMAP_THRESHOLD, 2**25)  # the largest that glibc accepts
 
@@ -60,8 +60,14 @@ def give_back_memory() -> None:
     Freed pieces of ever other sizes lie between those in use. SoftGM's edges are as many as are sensed: a training that
     used 1 GB held 7 after an hour, and grew.
     """
-    if platform.libc_ver()[0] == "glibc":
-        ctypes.CDLL(None).malloc_trim(0)
+    libc = _glibc()
+    if libc is not None:
+        libc.malloc_trim(0)
+
+
+def _glibc() -> ctypes.CDLL | None:
+    """The process's C library, if it is glibc."""
+    return ctypes.CDLL(None) if platform.libc_ver()[0] == "glibc" else None
 
 
 def _products_are_float32() -> bool:

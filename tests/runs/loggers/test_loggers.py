@@ -71,7 +71,10 @@ class TestWandb:
     @pytest.fixture
     def file(self, logged):
         pytest.importorskip("wandb")
+        import wandb_file
+
         (path,) = logged.glob("wandb/offline-run-*/run-*.wandb")
+        wandb_file.wait_for_end(path)
         return path
 
     def test_the_history_holds_every_row_by_frames(self, logged, file):

@@ -2,7 +2,9 @@
 
 import json
 import struct
+import time
 
+from google.protobuf.message import DecodeError
 from wandb.proto import wandb_internal_pb2
 
 BLOCK, HEADER = 32768, 7
@@ -28,6 +30,19 @@ def records(path):
             record = wandb_internal_pb2.Record()
             record.ParseFromString(whole)
             yield record
+
+
+def wait_for_end(path, seconds=60.0):
+    """Wait until the run's exit is written: W&B's own process may write it after ``finish`` has returned."""
+    until = time.monotonic() + seconds
+    while time.monotonic() < until:
+        try:
+            if any(record.HasField("exit") for record in records(path)):
+                return
+        except DecodeError:  # the last record is half written
+            pass
+        time.sleep(0.1)
+    raise TimeoutError(f"{path}: no end of the run within {seconds} s")
 
 
 def _items(items):
