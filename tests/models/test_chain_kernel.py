@@ -31,7 +31,7 @@ def test_it_equals_the_tensor_operations_forward_and_backward(graphs, n_agents, 
         layer._compiles = lambda _, compiles=compiles: compiles
         layer.zero_grad()
         inputs = nodes.clone().requires_grad_()
-        out, weights = layer.chain(layer.project(inputs, layer.joint_weight(), receives=True), n_agents)
+        out, weights = layer.chain(layer.project(inputs, layer.joint_weight()), n_agents)
         (out * torch.arange(1.0, 1.0 + out.shape[1], dtype=dtype)).square().sum().backward()
         results.append([out, weights, inputs.grad, *(parameter.grad.clone() for parameter in layer.parameters())])
     # small gradients are sums of large terms, so that rounding goes with the largest number anywhere
@@ -46,5 +46,5 @@ def test_the_layer_takes_the_kernel_on_a_cpu_and_only_for_the_papers_scores(monk
     monkeypatch.setattr(chain_kernel, "aggregate", lambda *arguments: calls.append(1) or kernel(*arguments))
     for gatv2, expected in ((False, 1), (True, 1)):
         layer = GraphAttention(4, 6, 2, gatv2)
-        layer.chain(layer.project(torch.randn(6, 4), layer.joint_weight(), receives=True), 3)
+        layer.chain(layer.project(torch.randn(6, 4), layer.joint_weight()), 3)
         assert len(calls) == expected

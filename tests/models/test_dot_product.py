@@ -132,5 +132,5 @@ def test_distances_are_those_from_an_agent_to_what_it_hears():
         for slot in range(5):
             centre = td[entries.SLOT_DESCRIPTOR][environment, slot, :3]
             assert math.isclose(of_slots.bins[environment, agent, slot], math.dist(here, centre), abs_tol=1e-12)
-    edges = hearing.edges
+    edges = hearing.heard
     torch.testing.assert_close(far.bins, of_slots.bins[edges.target // 3, edges.target % 3, edges.slot])

@@ -103,15 +103,13 @@ def test_sense_gathers_every_edge_once_sorted_by_target(lead, sizes, seed):
     n_agents, n_slots = sizes
     sensed = graph.sense(td)
     edge = td[entries.EDGE].reshape(math.prod(lead), n_agents, n_slots)
-    if sensed is None:
-        assert not edge.any()
-        return
     rebuilt = torch.zeros_like(edge)
     rebuilt[sensed.target // n_agents, sensed.target % n_agents, sensed.slot] = True
     assert torch.equal(rebuilt, edge)
     assert len(sensed.target) == edge.sum()
     assert (sensed.target.diff() >= 0).all()
+    assert torch.equal(sensed.first.diff(), edge.sum(-1).flatten())
     # One node for each sensed slot, with that slot's features.
     assert len(sensed.channels) == edge.any(dim=1).sum()
-    features = graph.slot_channels(td).reshape(-1, n_slots, 15)[sensed.target // n_agents, sensed.slot]
+    features = graph.slot_channels(td).reshape(math.prod(lead), n_slots, 15)[sensed.target // n_agents, sensed.slot]
     assert torch.equal(sensed.channels[sensed.source], features)

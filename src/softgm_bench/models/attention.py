@@ -6,13 +6,13 @@ from torch import Tensor
 from softgm_bench.models.graph import Sensed
 
 
-def entity_attention(own: Tensor, incoming: Tensor | None, sensed: Sensed | None, shape: tuple[int, int]) -> Tensor:
+def entity_attention(own: Tensor, incoming: Tensor, sensed: Sensed, shape: tuple[int, int]) -> Tensor:
     """Stage 1's weights over all nodes.
 
     Args:
         own: weights of the self-loops of packed agents, ``(B N, H)``.
-        incoming: weights of the edges, ``(E, H)``; None without edges.
-        sensed: the edges; None without edges.
+        incoming: weights of the edges, ``(E, H)``.
+        sensed: the edges.
         shape: N and M.
 
     Returns:
@@ -22,8 +22,7 @@ def entity_attention(own: Tensor, incoming: Tensor | None, sensed: Sensed | None
     rows = torch.arange(own.shape[0], device=own.device)
     dense = own.new_zeros(own.shape[0], n_agents + n_slots, own.shape[1])
     dense[rows, rows % n_agents] = own
-    if sensed is not None and incoming is not None:
-        dense[sensed.target, n_agents + sensed.slot] = incoming
+    dense[sensed.target, n_agents + sensed.slot] = incoming
     return dense.unflatten(0, (-1, n_agents)).movedim(-1, 1)
 
 

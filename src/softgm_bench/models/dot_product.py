@@ -45,18 +45,16 @@ class Hearing(NamedTuple):
         reach: how many places away on the chain an agent is heard.
         itself: whether an agent hears itself.
         bins: nodes of the bins, ``(K, 15)`` of those that some agent hears, or ``(B M, 15)`` of all slots.
-        edges: edges from the former; None if there is none, or for all slots.
-        absent: what is added to scores of all slots, ``(B, N, 1, M)``: 0 where the agent hears the slot, else -inf;
-            None for gathered bins.
-        n_slots: M of the observation, of which ``absent`` may leave out the last ones.
+        heard: edges from the former; or what is added to scores of all slots, ``(B, N, 1, M)``: 0 where the agent
+            hears the slot, else -inf.
+        n_slots: M of the observation, of which ``heard`` may leave out the last ones.
     """
 
     n_agents: int
     reach: int
     itself: bool
     bins: Tensor
-    edges: graph.Sensed | None
-    absent: Tensor | None
+    heard: graph.Sensed | Tensor
     n_slots: int
 
 
@@ -102,12 +100,11 @@ def listen(td: TensorDictBase, reach: int | None, itself: bool, discovered: bool
     reach = n_agents if reach is None else reach
     if sync.is_free(device) and not discovered and not functorch.transforms_active():
         edges = graph.sense(td)
-        bins = td[entries.SLOT_DESCRIPTOR].new_empty(0, graph.CHANNELS) if edges is None else edges.channels
-        return Hearing(n_agents, reach, itself, bins, edges, None, n_slots)
+        return Hearing(n_agents, reach, itself, edges.channels, edges, n_slots)
     if sync.is_free(device):
         td = graph.without_empty_slots(td)
     absent = graph.absent_slots(td, discovered)
-    return Hearing(n_agents, reach, itself, graph.all_slots(td).flatten(0, 1), None, absent, n_slots)
+    return Hearing(n_agents, reach, itself, graph.all_slots(td).flatten(0, 1), absent, n_slots)
 
 
 def distances(hearing: Hearing, position: Tensor) -> Distances:
@@ -115,12 +112,10 @@ def distances(hearing: Hearing, position: Tensor) -> Distances:
     of_environment = position.unflatten(0, (-1, hearing.n_agents))
     agents = _length(of_environment.unsqueeze(2) - of_environment.unsqueeze(1)).flatten(0, 1)
     centre = hearing.bins[:, :3]
-    if hearing.absent is not None:
-        centre = centre.unflatten(0, _slots(hearing.absent)).unsqueeze(1)
+    if isinstance(hearing.heard, Tensor):
+        centre = centre.unflatten(0, _slots(hearing.heard)).unsqueeze(1)
         return Distances(agents, _length(of_environment.unsqueeze(2) - centre))
-    if hearing.edges is None:
-        return Distances(agents, position.new_empty(0))
-    ways = position.index_select(0, hearing.edges.target) - centre.index_select(0, hearing.edges.source)
+    ways = position.index_select(0, hearing.heard.target) - centre.index_select(0, hearing.heard.source)
     return Distances(agents, _length(ways))
 
 
@@ -136,31 +131,24 @@ def attend(
         far: the distances; None: all are 0.
         slope: ``(T, H)``; belongs to ``far``.
     """
-    if hearing.absent is not None:
-        return _masked(agents, bins, hearing.absent, hearing, far, slope)
-    edges = hearing.edges
+    edges = hearing.heard
+    if isinstance(edges, Tensor):
+        return _masked(agents, bins, edges, hearing, far, slope)
     if far is None:
-        n_edges = 0 if edges is None else len(edges.source)
-        far = Distances(agents.new_zeros(len(agents), hearing.n_agents), agents.new_zeros(n_edges))
+        far = Distances(agents.new_zeros(len(agents), hearing.n_agents), agents.new_zeros(len(edges.source)))
     if slope is None:
         slope = agents.new_zeros(len(agents), agents.shape[2])
-    if edges is None:
-        first = source = torch.zeros(len(agents) + 1, dtype=torch.long)
-    else:
-        first = torch.searchsorted(edges.target, torch.arange(len(agents) + 1))
-        source = edges.source
     sizes = (hearing.n_agents, hearing.reach, hearing.itself)
-    return Heard(*DotProductAttention.apply(agents, bins, slope, *far, first, source, sizes))
+    return Heard(*DotProductAttention.apply(agents, bins, slope, *far, edges.first, edges.source, sizes))
 
 
 def weights(heard: Heard, hearing: Hearing) -> Tensor:
     """Give the weights over all nodes, agents first, ``(B, H, N, N + M)``."""
-    if hearing.absent is not None:
+    if isinstance(hearing.heard, Tensor):
         bins = functional.pad(heard.of_bins, (0, hearing.n_slots - heard.of_bins.shape[-1]))
     else:
         by_slot = heard.of_agents.new_zeros(len(heard.of_agents), hearing.n_slots, heard.of_agents.shape[1])
-        if hearing.edges is not None:
-            by_slot[hearing.edges.target, hearing.edges.slot] = heard.of_bins
+        by_slot[hearing.heard.target, hearing.heard.slot] = heard.of_bins
         bins = by_slot.mT
     return torch.cat([heard.of_agents, bins], dim=-1).unflatten(0, (-1, hearing.n_agents)).transpose(1, 2)
 

@@ -3,7 +3,7 @@
 One set of parameters, five forms of the same layer:
 
 - ``forward``: dense and masked, for any adjacency; the plain reference;
-- ``entity_to_agent``: an edge list from obstacle nodes to agents, plus the agents' self-loops (stage 1);
+- ``edges_to_agent``: an edge list from obstacle nodes to agents, plus the agents' self-loops (stage 1);
 - ``slots_to_agent``: the same from all slots, masked: shapes do not depend on the edges, and no value is looked at;
 - ``chain``: neighbours on a chain plus self-loops (stage 2);
 - ``chain_masked``: the same as dense attention, in fewer and larger operations.
@@ -20,6 +20,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from softgm_bench.models.chain_kernel import ChainAttention
+from softgm_bench.models.edge_kernel import EdgeAttention
+from softgm_bench.models.graph import Sensed
 from softgm_bench.upstream import functorch
 
 Affine = tuple[Tensor, Tensor | None]  # weight and offset of a linear map
@@ -32,13 +34,13 @@ class Projection(NamedTuple):
     Attributes:
         message: u, ``(..., H, C)``.
         source: the node's part of a score as a source: ``(..., H)``, for GATv2 ``(..., H, C)``.
-        target: the same as a target; None for nodes that receive nothing.
+        target: the same as a target.
         values: all of it side by side, as it was computed, ``(..., out + 2 H)``; for GATv2 ``(..., 2 out)``.
     """
 
     message: Tensor
     source: Tensor
-    target: Tensor | None
+    target: Tensor
     values: Tensor
 
 
@@ -102,43 +104,48 @@ class GraphAttention(nn.Module):
         scores = vectors @ self.weight.unflatten(0, (self.heads, self.channels))
         return torch.cat([self.weight, scores.flatten(0, -2)])
 
-    def project(self, nodes: Tensor, weight: Tensor, offset: Tensor | None = None, *, receives: bool) -> Projection:
+    def project(self, nodes: Tensor, weight: Tensor, offset: Tensor | None = None) -> Projection:
         """Apply ``joint_weight()``, or a product of it with an earlier linear map, to nodes ``(..., in)``."""
-        out = self.heads * self.channels
-        if not receives:  # the rows of the target's part are not needed
-            kept = out if self.gatv2 else out + self.heads
-            weight, offset = weight[:kept], None if offset is None else offset[:kept]
         values = functional.linear(nodes, weight, offset)
-        widths = [out] * (1 + receives) if self.gatv2 else [out, *[self.heads] * (1 + receives)]
-        first, *others = values.split(widths, dim=-1)
-        message = first.unflatten(-1, (self.heads, self.channels))
+        out = self.heads * self.channels
+        message = values[..., :out].unflatten(-1, (self.heads, self.channels))
         if self.gatv2:
-            target = others[0].unflatten(-1, (self.heads, self.channels)) if receives else None
-            return Projection(message, message, target, values)
-        return Projection(message, others[0], others[1] if receives else None, values)
+            return Projection(message, message, values[..., out:].unflatten(-1, message.shape[-2:]), values)
+        source, target = values[..., out:].chunk(2, dim=-1)
+        return Projection(message, source, target, values)
 
-    def entity_to_agent(
-        self, agents: Projection, entities: Projection, source: Tensor, target: Tensor
+    def edges_to_agent(
+        self, agents: Projection, nodes: Tensor, affine: Affine, edges: Sensed, n_agents: int
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Stage 1 over an edge list: each agent hears itself and the obstacle nodes with an edge to it.
 
         Args:
-            agents: projections of T packed agents.
-            entities: projections of K packed obstacle nodes.
-            source: the obstacle node of each edge, ``(E,)``.
-            target: the agent of each edge, ``(E,)``, ascending.
+            agents: projections of T packed agents, T a multiple of N.
+            nodes: K packed obstacle nodes, ``(K, in)``.
+            affine: ``weight``, or a product of it with an earlier linear map: ``(out, in)``, and an offset.
+            edges: E edges between them.
+            n_agents: N.
 
         Returns:
             New agents ``(T, out_features)`` and the weights of self-loops ``(T, H)`` and of edges ``(E, H)``.
         """
-        assert agents.target is not None
-        message = entities.message.index_select(0, source)
-        source_part = message if self.gatv2 else entities.source.index_select(0, source)
+        if not len(edges.source):  # every agent hears only itself
+            own = agents.message.new_ones(len(agents.message), self.heads)
+            return self.output(agents.message), own, own[:0]
+        if self._compiles(agents.message):
+            scores = (*self._source_rows(affine), agents.target, agents.target + agents.source)
+            own, mixed, incoming = EdgeAttention.apply(
+                nodes, *scores, edges.first, edges.source, n_agents, NEGATIVE_SLOPE
+            )
+            return self._mixed_message(agents, mixed, own.unsqueeze(-1), affine), own, incoming
+        message = functional.linear(nodes, *affine).unflatten(-1, (self.heads, self.channels))
+        message = message.index_select(0, edges.source)
+        source = message if self.gatv2 else (message * self.source).sum(-1)
         own = self._score(agents.target + agents.source)
-        incoming = self._score(agents.target.index_select(0, target) + source_part)
-        own, incoming = edge_softmax(own, incoming, target)
+        incoming = self._score(agents.target.index_select(0, edges.target) + source)
+        own, incoming = edge_softmax(own, incoming, edges.target)
         aggregated = own.unsqueeze(-1) * agents.message
-        aggregated = aggregated.index_add(0, target, incoming.unsqueeze(-1) * message)
+        aggregated = aggregated.index_add(0, edges.target, incoming.unsqueeze(-1) * message)
         return self.output(aggregated), own, incoming
 
     def project_agents(self, agents: Tensor, pending: Affine | None) -> Projection:
@@ -147,7 +154,7 @@ class GraphAttention(nn.Module):
         Scores are taken from the messages: on a GPU that is less than to make one matrix of weights at every step.
         """
         if self.gatv2:
-            return self.project(agents, *after(self.joint_weight(), pending), receives=True)
+            return self.project(agents, *after(self.joint_weight(), pending))
         message = functional.linear(agents, *after(self.weight, pending)).unflatten(-1, (self.heads, self.channels))
         vectors = torch.stack([self.source, self.target], dim=-1)
         source, target = torch.bmm(message.transpose(0, 1), vectors).permute(2, 1, 0)
@@ -158,8 +165,7 @@ class GraphAttention(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Stage 1 over all slots: each agent hears itself and the slots that it senses.
 
-        The slots' messages are never formed: what is linear can follow the weighted sum over slots as well, which has
-        N H rows an environment instead of M. (GATv2's scores need them.)
+        The slots' messages are formed for GATv2's scores alone, as ``edge_kernel`` explains.
 
         Args:
             agents: projections of ``B N`` packed agents.
@@ -170,29 +176,34 @@ class GraphAttention(nn.Module):
         Returns:
             New agents ``(B N, out_features)``, weights of self-loops ``(B N, H)`` and of slots ``(B, N, H, M)``.
         """
-        assert agents.target is not None
         shape = absent.shape[:2]
-        weight, offset = affine
-        heads = weight.unflatten(0, (self.heads, self.channels))
-        offsets = None if offset is None else offset.unflatten(0, (self.heads, self.channels))
         target, own = agents.target.unflatten(0, shape), agents.source.unflatten(0, shape)
         if self.gatv2:
-            message = functional.linear(slots, weight, offset).unflatten(-1, (self.heads, self.channels))
+            message = functional.linear(slots, *affine).unflatten(-1, (self.heads, self.channels))
             pairs = torch.cat([(target + own).unsqueeze(2), target.unsqueeze(2) + message.unsqueeze(1)], dim=2)
             scores = self._score(pairs).transpose(-1, -2) + functional.pad(absent, (1, 0))
         else:
-            rows = torch.bmm(self.source.unsqueeze(1), heads).squeeze(1)
-            part = None if offsets is None else (self.source * offsets).sum(-1)
-            source = functional.linear(slots, rows, part).mT.unsqueeze(1) + absent
+            source = functional.linear(slots, *self._source_rows(affine)).mT.unsqueeze(1) + absent
             scores = self._score(torch.cat([own.unsqueeze(-1), source], -1) + target.unsqueeze(-1))
         own_weight, weights = scores.softmax(-1).split([1, slots.shape[1]], -1)
         mixed = torch.bmm(weights.flatten(1, 2), slots).view(-1, self.heads, slots.shape[-1])
-        incoming = torch.bmm(mixed.transpose(0, 1), heads.mT).transpose(0, 1)  # (B N, H, C)
         own_weight = own_weight.flatten(0, 1)
-        if offsets is not None:  # as often as the weights say, which with the own one sum to 1
-            incoming = torch.addcmul(incoming, 1.0 - own_weight, offsets)
-        aggregated = torch.addcmul(incoming, own_weight, agents.message)
-        return self.output(aggregated), own_weight.squeeze(-1), weights
+        return self._mixed_message(agents, mixed, own_weight, affine), own_weight.squeeze(-1), weights
+
+    def _source_rows(self, affine: Affine) -> Affine:
+        """The scores of nodes as sources, ``(H, in)`` and ``(H,)``, for the map that gives their messages."""
+        rows, offset = affine[0].unflatten(0, (self.heads, self.channels)), affine[1]
+        part = None if offset is None else (self.source * offset.unflatten(0, self.source.shape)).sum(-1)
+        return torch.bmm(self.source.unsqueeze(1), rows).squeeze(1), part
+
+    def _mixed_message(self, agents: Projection, mixed: Tensor, own_weight: Tensor, affine: Affine) -> Tensor:
+        """New agents ``(T, out_features)`` from weighted sums of nodes ``(T, H, in)`` and own weights ``(T, H, 1)``."""
+        weight, offset = affine
+        heads = weight.unflatten(0, (self.heads, self.channels))
+        incoming = torch.bmm(mixed.transpose(0, 1), heads.mT).transpose(0, 1)  # (T, H, C)
+        if offset is not None:  # as often as the weights say, which with the own one sum to 1
+            incoming = torch.addcmul(incoming, 1.0 - own_weight, offset.unflatten(0, self.source.shape))
+        return self.output(torch.addcmul(incoming, own_weight, agents.message))
 
     def chain(self, agents: Projection, n_agents: int) -> tuple[Tensor, Tensor]:
         """Stage 2: each agent hears itself and its neighbours on the chain.
@@ -205,11 +216,10 @@ class GraphAttention(nn.Module):
             New agents ``(T, out_features)`` and the weights ``(3, T / N, N, H)`` of the previous agent, the agent
             itself and the next one; zero where there is none.
         """
-        assert agents.target is not None
         if self._compiles(agents.values):
             out, weights = ChainAttention.apply(agents.values, n_agents, self.heads, NEGATIVE_SLOPE)
             return out + self.bias, weights.unflatten(1, (-1, n_agents))
-        message, source, target = (part.unflatten(0, (-1, n_agents)) for part in agents[:3] if part is not None)
+        message, source, target = (part.unflatten(0, (-1, n_agents)) for part in agents[:3])
         absent = message.new_full((1,), -math.inf).expand(message.shape[0], 1, self.heads)
         previous = torch.cat([absent, self._score(target[:, 1:] + source[:, :-1])], dim=1)
         following = torch.cat([self._score(target[:, :-1] + source[:, 1:]), absent], dim=1)
@@ -231,9 +241,8 @@ class GraphAttention(nn.Module):
         Returns:
             New agents ``(T, out_features)`` and the weights ``(T / N, N, H, N)``.
         """
-        assert agents.target is not None
         n_agents = len(absent)
-        message, source, target = (part.unflatten(0, (-1, n_agents)) for part in agents[:3] if part is not None)
+        message, source, target = (part.unflatten(0, (-1, n_agents)) for part in agents[:3])
         if self.gatv2:
             scores = self._score(target.unsqueeze(2) + source.unsqueeze(1)).transpose(-1, -2)
         else:
@@ -243,7 +252,7 @@ class GraphAttention(nn.Module):
         return self.output(aggregated).flatten(0, 1), weights
 
     def _compiles(self, values: Tensor) -> bool:
-        """Tell whether ``ChainAttention`` can do it: the paper's scores, on a CPU, under no transform such as vmap."""
+        """Tell whether compiled loops can do it: the paper's scores, on a CPU, under no transform such as vmap."""
         plain = not functorch.is_wrapped(values)
         return plain and not self.gatv2 and values.device.type == "cpu"
 

@@ -155,21 +155,21 @@ class Sensed(NamedTuple):
         source: the node of each edge, ``(E,)``.
         target: the agent of each edge among all ``B N`` packed agents, ascending, ``(E,)``.
         slot: the slot of each edge's node, ``(E,)``.
+        first: the first edge of each packed agent, and E, ``(B N + 1,)``.
     """
 
     channels: Tensor
     source: Tensor
     target: Tensor
     slot: Tensor
+    first: Tensor
 
 
-def sense(td: TensorDictBase) -> Sensed | None:
-    """Gather what the entity -> agent edges need; None if there is no edge. Leading dimensions are packed into B."""
+def sense(td: TensorDictBase) -> Sensed:
+    """Gather what the entity -> agent edges need. Leading dimensions are packed into B."""
     edge = td[entries.EDGE]
     n_agents, n_slots = edge.shape[-2:]
     position = edge.reshape(-1).nonzero().squeeze(-1)
-    if position.numel() == 0:
-        return None
     target = position // n_slots
     slot = position - target * n_slots
     row = (target // n_agents) * n_slots + slot  # the slot's row among all B M slots
@@ -183,4 +183,5 @@ def sense(td: TensorDictBase) -> Sensed | None:
     descriptor = td[entries.SLOT_DESCRIPTOR].flatten(0, -2).index_select(0, rows)
     goal = td[entries.TARGET].reshape(-1, 3).index_select(0, environment)
     tip = td[entries.TIP].reshape(-1, 3).index_select(0, environment)
-    return Sensed(obstacle_channels(descriptor, goal, tip), rank.index_select(0, row), target, slot)
+    first = torch.searchsorted(target, torch.arange(edge.shape[:-1].numel() + 1, device=edge.device))
+    return Sensed(obstacle_channels(descriptor, goal, tip), rank.index_select(0, row), target, slot, first)

@@ -133,61 +133,54 @@ class SoftGMEncoder(Encoder):
         shape = td[entries.EDGE].shape[-2:]
         agents, pending = self._enter(channels.flatten(0, -2), graph.AGENT)  # packed: (B N, 15 or hidden)
         if len(self.stage1):
-            packed = sync.is_free(channels.device) and not self.config.remember
-            entity_stage = self._entity_stage if packed else self._slot_stage
-            agents = entity_stage(td, agents, pending, stage1)
-            pending = None
+            agents, pending = self._entity_stage(td, agents, pending, stage1), None
         if len(self.stage2):
             agents = self._agent_stage(agents, pending, shape[0], stage2)
         return agents.unflatten(0, channels.shape[:-1])
 
     def _entity_stage(self, td: TensorDictBase, agents: Tensor, pending: Affine | None, record: Record) -> Tensor:
-        """Stage 1: ``(B N, hidden)`` after L layers of entity -> agent messages."""
-        sensed = graph.sense(td)
-        if sensed is not None:
-            entities, entity_pending = self._enter(sensed.channels, graph.OBSTACLE)
-        for depth, layer in enumerate(_layers(self.stage1), start=1):
-            last = depth == len(self.stage1)
-            weight = layer.joint_weight()
-            own = layer.project(agents, *after(weight, pending), receives=True)
-            own_weights, edge_weights = None, None
-            if sensed is None:  # every agent hears only itself
-                out = layer.output(own.message)
-            else:
-                other = layer.project(entities, *after(weight, entity_pending), receives=False)
-                out, own_weights, edge_weights = layer.entity_to_agent(own, other, sensed.source, sensed.target)
-                if not last:  # an obstacle node hears only itself; nobody reads what the last layer makes of it
-                    entities, entity_pending = self._between(layer.output(other.message), entities, last=False), None
-            agents, pending = self._between(out, agents, last=last and not len(self.stage2)), None
-            if record is not None:
-                own_weights = out.new_ones(len(out), layer.heads) if own_weights is None else own_weights
-                record.append(entity_attention(own_weights, edge_weights, sensed, td[entries.EDGE].shape[-2:]))
-        return agents
+        """Stage 1: ``(B N, hidden)`` after L layers of entity -> agent messages.
 
-    def _slot_stage(self, td: TensorDictBase, agents: Tensor, pending: Affine | None, record: Record) -> Tensor:
-        """Stage 1 as ``_entity_stage`` computes it, from all M slots, or from those that are in use somewhere.
-
-        ``W_in`` is absorbed with residual connections too: a slot hears only itself, so they are linear there as well.
+        ``W_in`` is absorbed with residual connections too: an obstacle node hears only itself, so they are linear there
+        as well.
         """
-        if record is None and sync.is_free(agents.device):
-            td = graph.without_empty_slots(td)
-        absent = graph.absent_slots(td, self.config.remember)
-        slots = graph.all_slots(td)  # (B, M, 15), later (B, M, hidden)
-        slot_pending: Affine | None = self._input_of(graph.OBSTACLE)
+        n_agents, n_slots = td[entries.EDGE].shape[-2:]
+        nodes, heard = self._nodes(td, crop=record is None)
+        entity_pending: Affine | None = self._input_of(graph.OBSTACLE)
         for depth, layer in enumerate(_layers(self.stage1), start=1):
             last = depth == len(self.stage1)
-            affine = after(layer.weight, slot_pending)
-            own = layer.project_agents(agents, pending)
-            out, own_weights, slot_weights = layer.slots_to_agent(own, slots, affine, absent)
-            if not last:
-                slots, slot_pending = functional.elu(self._slot_message(slots, affine, slot_pending, layer.bias)), None
+            affine = after(layer.weight, entity_pending)
+            if isinstance(heard, graph.Sensed):
+                own = layer.project(agents, *after(layer.joint_weight(), pending))
+                out, own_weights, weights = layer.edges_to_agent(own, nodes, affine, heard, n_agents)
+            else:
+                own = layer.project_agents(agents, pending)
+                out, own_weights, weights = layer.slots_to_agent(own, nodes, affine, heard)
+            if not last:  # nobody reads what the last layer makes of obstacle nodes
+                nodes = functional.elu(self._slot_message(nodes, affine, entity_pending, layer.bias), inplace=True)
+                entity_pending = None
             agents, pending = self._between(out, agents, last=last and not len(self.stage2)), None
-            if record is not None:
-                record.append(slot_attention(own_weights, slot_weights))
+            if record is not None and isinstance(heard, graph.Sensed):
+                record.append(entity_attention(own_weights, weights, heard, (n_agents, n_slots)))
+            elif record is not None:
+                record.append(slot_attention(own_weights, weights))
         return agents
+
+    def _nodes(self, td: TensorDictBase, *, crop: bool) -> tuple[Tensor, graph.Sensed | Tensor]:
+        """Obstacle nodes and who hears them: packed, with edges, or all slots ``(B, M, 15)`` with ``absent_slots``.
+
+        ``crop`` leaves slots out that are in use nowhere.
+        """
+        is_free = sync.is_free(td[entries.EDGE].device)
+        if is_free and not self.config.remember:
+            sensed = graph.sense(td)
+            return sensed.channels, sensed
+        if is_free and crop:
+            td = graph.without_empty_slots(td)
+        return graph.all_slots(td), graph.absent_slots(td, self.config.remember)
 
     def _slot_message(self, slots: Tensor, affine: Affine, pending: Affine | None, bias: Tensor) -> Tensor:
-        """What slots make of themselves before the nonlinearity, ``(B, M, hidden)``.
+        """What slots make of themselves before the nonlinearity, ``(..., hidden)``.
 
         ``affine`` gives their messages and ``pending``, unless it is None, the embeddings that they stand for.
         """
@@ -202,7 +195,7 @@ class SoftGMEncoder(Encoder):
         absent = None if sync.is_free(agents.device) else graph.absent_neighbours(n_agents, agents.device, agents.dtype)
         for depth, layer in enumerate(_layers(self.stage2), start=1):
             if absent is None:
-                own = layer.project(agents, *after(layer.joint_weight(), pending), receives=True)
+                own = layer.project(agents, *after(layer.joint_weight(), pending))
                 out, weights = layer.chain(own, n_agents)
             else:
                 out, weights = layer.chain_masked(layer.project_agents(agents, pending), absent)
