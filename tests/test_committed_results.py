@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from omegaconf import OmegaConf
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from softgm_bench.analysis.statistics import mcnemar
@@ -106,12 +107,25 @@ def test_simulators_that_are_compared_played_the_same_scenes_with_the_same_polic
         }
 
 
-@pytest.mark.parametrize("path", POLICIES, ids=lambda path: path.stem)
-def test_a_kept_policy_belongs_to_a_committed_run(path, results):
-    trained = policy.load(path)
-    task = trained.config.task.name
-    assert path.stem == f"{task}_{trained.config.label}"
-    assert trained.frames in [run.final.frames for run in results.runs(task) if run.final.label == trained.config.label]
+def test_every_kept_policy_has_a_card_made_from_its_committed_run():
+    cards = script(ROOT / "experiments" / "cards.py")
+    assert cards.PAGE.read_text() == cards.page()
+    found = list(cards.cards())
+    assert [card.file for card in found] == POLICIES
+    for card in found:
+        assert card.file.stem == f"{card.run.final.task}_{card.run.final.label}"
+        beside = ROOT / "experiments" / card.folder / "policy.pt"
+        if beside.exists():
+            assert policy.fingerprint(policy.load(beside)) == policy.fingerprint(card.trained)
+        shown = OmegaConf.to_container(OmegaConf.structured(card.trained.run))
+        assert all(shown[key] == card.run.config[key] for key in ("seed", "observation")), card.file
+
+
+def test_no_kept_policy_names_a_folder_of_the_machine_that_trained_it():
+    committed = [*POLICIES, *(ROOT / "experiments").glob("*/*/*/seed*/policy.pt")]
+    assert len(committed) > len(POLICIES)
+    for path in committed:
+        assert policy.load(path).run.run_dir.startswith("outputs/"), path
 
 
 @pytest.mark.parametrize(
@@ -223,7 +237,9 @@ def folders_elsewhere(results):
 
 
 def test_policies_were_tested_elsewhere_in_the_settings_that_their_folders_name_and_are_the_kept_ones(results):
-    names = {path.stem: policy.fingerprint(policy.load(path)) for path in POLICIES}
+    earlier = {"wall_softgm": ROOT / "experiments/trained/wall/softgm/seed0/policy.pt"}
+    files = {path.stem: path for path in POLICIES} | earlier
+    names = {stem: policy.fingerprint(policy.load(path)) for stem, path in files.items()}
     for folder in folders_elsewhere(results):
         task, algo, name = folder.relative_to(results.SECTIONS).parts
         summary = json.loads((folder / "summary.json").read_text())

@@ -1,0 +1,98 @@
+"""Cards of the kept policies: ``python experiments/cards.py`` writes ``experiments/policies/README.md``.
+
+Each policy is the actor of a run whose data are committed; what its card says is read from both.
+"""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from softgm_bench.analysis.runs import Run, find
+from softgm_bench.episodes import policy
+from softgm_bench.episodes.policy import TrainedPolicy
+
+ROOT = Path(__file__).parents[1]
+POLICIES = ROOT / "experiments" / "policies"
+PAGE = POLICIES / "README.md"
+RUNS = ("campaign", "trained")  # folders of experiments that hold runs; a policy is of the first that has its run
+INTRODUCTION = """# Trained policies
+
+Each file is an actor with the settings of its run. In a clone, `softgm-bench evaluate FILE` plays it, `softgm-bench
+render FILE out=arm.html` shows it, and `softgm_bench.api.load(FILE)` gives it to a program
+([Python](../../docs/api_tour.md)). An actor reads [what agents observe](../../docs/environment.md) and writes couples
+for each section. It was trained in simulation alone and has moved no real arm. MIT licence, as the software.
+
+Success is that of the run's final evaluation: deterministic actions, targets that training never saw, tip within 5 cm.
+Runs of `trained` had [recipes of their time](../../docs/results.md#earlier-runs); their settings are in their folders,
+and a run with today's is another one."""
+
+
+class Card(NamedTuple):
+    """A kept policy and the run that it is of.
+
+    Attributes:
+        file: below ``experiments/policies``.
+        trained: what it holds.
+        folder: of the run, below ``experiments``.
+        run: the run's data.
+    """
+
+    file: Path
+    trained: TrainedPolicy
+    folder: Path
+    run: Run
+
+
+def cards() -> Iterator[Card]:
+    """Give the card of every policy.
+
+    Raises:
+        SystemExit: a policy is of no run whose data are here.
+    """
+    for file in sorted(POLICIES.glob("*.pt")):
+        trained = policy.load(file)
+        cell = Path(trained.run.task.name, trained.label, f"seed{trained.run.seed}")
+        for folder in (Path(runs) / cell for runs in RUNS):
+            found = find(ROOT / "experiments" / folder).runs if (ROOT / "experiments" / folder).exists() else []
+            if found and found[0].final.frames == trained.frames:
+                yield Card(file, trained, folder, found[0])
+                break
+        else:
+            raise SystemExit(f"{file.name}: no run of {cell} in {' or '.join(RUNS)} has {trained.frames} frames")
+
+
+def written(card: Card) -> str:
+    """Write a card as Markdown."""
+    result, run = card.run.summary["final_evaluation"], card.run
+    success, final = result["success_rate"], card.run.final
+    place = os.path.relpath(ROOT / "experiments" / card.folder, POLICIES)
+    lines = [
+        f"## {card.file.name}",
+        "",
+        f"- **Task**: [`{final.task}`](../../docs/tasks.md), {run.config['task']['n_agents']} agents",
+        f"- **Algorithm**: {final.label}, seed {final.seed}, {final.frames:,} frames, {run.minutes:.0f} minutes",
+        f"- **Success**: {success['mean']:.3f}, 95 % interval [{success['low']:.3f}, {success['high']:.3f}], "
+        f"{result['episodes']} episodes of at most {final.horizon:,} control steps",
+        f"- **Run**: [experiments/{card.folder.as_posix()}]({place})",
+    ]
+    if card.folder.parts[0] == "campaign":
+        lines.append(f"- **Command**: `{command(card)}`")
+    return "\n".join(lines)
+
+
+def command(card: Card) -> str:
+    """Give the command that trained a policy of the campaign, which asks for nothing but its cell and its machine."""
+    run = card.trained.run
+    named = f"algo={run.algo.name} task={run.task.name} seed={run.seed} threads={run.threads} matmul={run.matmul}"
+    return f"python -m softgm_bench {named}"
+
+
+def page() -> str:
+    """Write all cards."""
+    return "\n\n".join([INTRODUCTION, *map(written, cards())]) + "\n"
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page())
+    print(f"written: {PAGE.relative_to(ROOT)}")
