@@ -121,6 +121,26 @@ def test_every_kept_policy_has_a_card_made_from_its_committed_run():
         assert all(shown[key] == card.run.config[key] for key in ("seed", "observation")), card.file
 
 
+def test_what_embeddings_know_of_an_opening_is_stated_of_the_committed_policies():
+    probe = script(ROOT / "experiments" / "probe.py")
+    text = probe.PAGE.read_text()
+    assert probe.page(text) == text
+    known = {}
+    for name, path in probe.POLICIES.items():
+        figures = json.loads((probe.FOLDER / f"{name}.json").read_text())
+        assert figures["parameters"] == policy.fingerprint(policy.load(path))
+        known[name] = {row["step"]: row for row in figures["rows"]}
+    (stated,) = re.findall(r"on `wall` embeddings know ([0-9.]+) then,\s+([0-9.]+) with obstacles hidden", text)
+    assert stated == tuple(f"{known['wall_softgm'][12][name]:.2f}" for name in ("embedding", "hidden"))
+
+
+def test_a_readout_explains_what_is_linear_and_nothing_of_what_is_random():
+    probe = script(ROOT / "experiments" / "probe.py")
+    inputs = torch.randn(500, 40, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    assert probe.explained(inputs, inputs[:, :2] + 3.0) > 0.99
+    assert probe.explained(inputs[:, 2:], inputs[:, :2]) < 0.05
+
+
 def test_no_kept_policy_names_a_folder_of_the_machine_that_trained_it():
     committed = [*POLICIES, *(ROOT / "experiments").glob("*/*/*/seed*/policy.pt")]
     assert len(committed) > len(POLICIES)
