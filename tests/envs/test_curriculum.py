@@ -203,12 +203,17 @@ def test_without_a_difficulty_an_enabled_curriculum_draws_the_tasks_own_scenes(s
     assert torch.equal(expected.cylinders.length, found.cylinders.length[:, : own.max_cylinders])
 
 
-@given(value=st.floats(0.0, 1.0), seed=st.integers(0, 2**32 - 1), name=st.sampled_from(("wall", "wall_narrow")))
+@given(
+    value=st.floats(0.0, 1.0),
+    offset=st.sampled_from((0.0, 0.25, 1.0)),
+    seed=st.integers(0, 2**32 - 1),
+    name=st.sampled_from(("wall", "wall_narrow")),
+)
 @hypothesis_settings(max_examples=40, deadline=None)
 def test_openings_lie_between_the_easiest_and_the_tasks_own_and_lead_to_targets_within_reach(
-    settings, value, seed, name
+    settings, value, offset, seed, name
 ):
-    config = settings(f"task={name}", ENABLED).task
+    config = settings(f"task={name}", ENABLED, f"task.curriculum.easy_target_offset={offset}").task
     easy = config.curriculum
     scene = make_task(config).sample(40, torch.Generator().manual_seed(seed), level(value))
     opening, side = scene.privileged[:, :3], scene.privileged[:, 3]
@@ -222,7 +227,7 @@ def test_openings_lie_between_the_easiest_and_the_tasks_own_and_lead_to_targets_
         assert ((opening[:, axis] >= low) & (opening[:, axis] <= high)).all()
         # no farther to the side of the opening than the difficulty's share of what the task allows
         spread = (scene.target - opening)[:, axis].abs()
-        assert (spread <= value * (high - low) + 1e-12).all()
+        assert (spread <= (value + offset * (1.0 - value)) * (high - low) + 1e-12).all()
     low, high = ((1.0 - value) * a + value * b for a, b in zip(easy.easy_target_x, config.target_x, strict=True))
     assert ((scene.target[:, 0] >= low - 1e-12) & (scene.target[:, 0] <= high + 1e-12)).all()
     _check_columns(scene, config)
@@ -247,6 +252,19 @@ def _check_columns(scene, config):
         assert torch.allclose(top[upper], level(config.wall_z[1]).expand(int(upper.sum())))
         cut = ((standing - y).abs() <= side / 2 + 1e-12).sum()
         assert lower.sum() == cut
+
+
+@pytest.mark.parametrize("name", ["wall", "wall_sense"])
+def test_the_easiest_targets_keep_the_share_of_their_offset_that_is_asked_for(settings, name):
+    def easiest(offset):
+        config = settings(f"task={name}", ENABLED, f"task.curriculum.easy_target_offset={offset}").task
+        scene = make_task(config).sample(60, torch.Generator().manual_seed(3), level(0.0))
+        return (scene.target - scene.privileged[:, :3])[:, 1:], config
+
+    (none, config), (whole, _) = easiest(0.0), easiest(1.0)
+    assert torch.equal(none, torch.zeros_like(none))
+    for axis, (low, high) in enumerate((config.target_y, config.target_z)):
+        assert whole[:, axis].std() > 0.2 * (high - low)
 
 
 @given(value=st.floats(0.0, 1.0), seed=st.integers(0, 2**32 - 1))
@@ -286,6 +304,7 @@ def test_targets_of_the_other_tasks_fill_ranges_between_the_easiest_and_their_ow
         ("task.curriculum.promote=1.0", r"task.curriculum.promote 1.0"),
         ("task.curriculum.demote=-0.1", r"task.curriculum.demote is -0.1"),
         ("task.curriculum.easy_opening_side=0.2", r"task.curriculum.easy_opening_side is 0.2"),
+        ("task.curriculum.easy_target_offset=1.5", r"task.curriculum.easy_target_offset is 1.5: it must lie between"),
         ("task.curriculum.easy_opening_side=1.2", r"with task.curriculum.easy_opening_side 1.2"),
     ],
 )

@@ -115,7 +115,7 @@ class VariedWall(Wall):
         openings = self._split(drawn)
         centre = self._placed(drawn, openings[0])
         if difficulty is not None:
-            target[:, 1:] = torch.lerp(centre[:, 1:], target[:, 1:], difficulty)
+            target[:, 1:] = torch.lerp(centre[:, 1:], target[:, 1:], c.curriculum.kept_offset(difficulty))
         told = [centre, side.expand(count, 1), *([drawn[:, 1:2]] if c.wall_yaw else [])]
         return Scene(
             target=target,

@@ -28,6 +28,23 @@ class WallCurriculumConfig(CurriculumConfig):
 
     easy_opening_side: float
     easy_target_x: Range
+    easy_target_offset: float
+
+    def __post_init__(self) -> None:
+        """Refuse values by which nothing could be decided or drawn.
+
+        Raises:
+            ValueError: with one line naming the key, its value and what would be right.
+        """
+        super().__post_init__()
+        if not 0.0 <= self.easy_target_offset <= 1.0:
+            raise ValueError(
+                f"task.curriculum.easy_target_offset is {self.easy_target_offset}: it must lie between 0 and 1"
+            )
+
+    def kept_offset(self, difficulty: Tensor) -> Tensor:
+        """The share of its distance in y and z from the opening's centre that a target keeps; exactly 1 at the end."""
+        return difficulty + self.easy_target_offset * (1.0 - difficulty)
 
 
 @dataclass
@@ -55,7 +72,8 @@ class Wall(Task):
 
     Opening and target are drawn independently and redrawn together until the way from the base through the opening's
     centre to the target is at most ``max_path`` long. In the easiest scenes of a curriculum the opening is wider, and
-    the target nearer and straight behind its centre (same y and z).
+    the target nearer and straight behind its centre (same y and z), or ``easy_target_offset`` of the way to its own
+    place from there.
 
     A scene's ``privileged``: the opening's centre and side, m.
     """
@@ -104,7 +122,7 @@ class Wall(Task):
         def draw(n: int) -> Tensor:
             pair = uniform_box(n, box, generator).unflatten(-1, (2, 3))
             if difficulty is not None:
-                pair[:, 1, 1:] = torch.lerp(pair[:, 0, 1:], pair[:, 1, 1:], difficulty)
+                pair[:, 1, 1:] = torch.lerp(pair[:, 0, 1:], pair[:, 1, 1:], c.curriculum.kept_offset(difficulty))
             return pair
 
         def reachable(pair: Tensor) -> Tensor:
