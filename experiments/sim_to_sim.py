@@ -25,6 +25,11 @@ FOLDER = ROOT / "experiments" / "sim_to_sim"
 PAGE = ROOT / "docs" / "trajectories.md"
 OURS, THEIRS, SHIPPED = "numba", "pyelastica", "pyelastica_as_shipped"
 PLAYED = {"basic": None, "structured": None, "wall": 200}  # horizon by task; None: the task's own
+POLICIES = {  # below experiments
+    "basic": "policies/basic_softgm.pt",
+    "structured": "policies/structured_softgm.pt",
+    "wall": "trained/wall/softgm/seed0/policy.pt",
+}
 HEADER = (
     "| task | success: ours | PyElastica | as shipped | ours and PyElastica: same success | same length too "
     "| largest difference of their final distance, m | ours and as shipped: same success | same length too |"
@@ -34,7 +39,7 @@ HEADER = (
 def play(task: str, place: str) -> None:
     """Evaluate a committed policy as ``softgm_bench.evaluate`` does."""
     overrides = [f"backend={OURS if place == OURS else THEIRS}"]
-    trained = policy.load(ROOT / "experiments" / "policies" / f"{task}_softgm.pt", overrides=overrides)
+    trained = policy.load(ROOT / "experiments" / POLICIES[task], overrides=overrides)
     protocol = Protocol(episodes=20, horizon=PLAYED[task])
 
     def build(count: int, seed: int) -> Any:
