@@ -16,6 +16,8 @@ SCENES = (
     ("wall_softgm", ("wall_fixed.png",), ("task=wall_fixed", "seed=8")),
     ("wall_softgm", ("wall_search.png",), ("task=wall_search", "seed=3")),
     ("wall_softgm", ("wall_decoy.png",), ("task=wall_decoy", "seed=6")),
+    ("wall_sense_softgm", ("wall_sense.png",), ("seed=0",)),
+    ("wall_sense_softgm", ("wall_sense.webp",), ("seed=0", "width=480", "height=360", "fps=20")),
     ("wall_softgm", ("wall.mp4", "wall.html"), ("seed=3",)),
     ("wall_softgm", ("wall.webp",), ("seed=3", "width=480", "height=360", "fps=20")),
 )

@@ -30,10 +30,16 @@ FOLDER = ROOT / "experiments" / "probes"
 PAGE = ROOT / "docs" / "results.md"
 POLICIES = {
     f"{task}_{label}": ROOT / "experiments" / "campaign" / task / label / "seed0" / "policy.pt"
-    for task, label in (("wall", "softgm"), ("wall_touch", "softgm"), ("wall_touch", "softgm_no_stage1"))
+    for task, label in (
+        ("wall", "softgm"),
+        ("wall_touch", "softgm"),
+        ("wall_touch", "softgm_no_stage1"),
+        ("wall_sense", "softgm"),
+        ("wall_sense", "softgm_no_stage1"),
+    )
 }
 EPISODES, SEED, FOLDS = 500, 20_261_128, 5
-STEPS = (8, 12, 16, 20)  # after so many control steps
+STEPS = (5, 6, 8, 12, 16)  # after so many control steps
 RIDGE = 1e-2  # times the number of episodes, for features of unit variance
 SOURCES = {
     "own": "own nodes",

@@ -130,8 +130,14 @@ def test_what_embeddings_know_of_an_opening_is_stated_of_the_committed_policies(
         figures = json.loads((probe.FOLDER / f"{name}.json").read_text())
         assert figures["parameters"] == policy.fingerprint(policy.load(path))
         known[name] = {row["step"]: row for row in figures["rows"]}
-    (stated,) = re.findall(r"on `wall` embeddings know ([0-9.]+) then,\s+([0-9.]+) with obstacles hidden", text)
-    assert stated == tuple(f"{known['wall_softgm'][12][name]:.2f}" for name in ("embedding", "hidden"))
+    said = " ".join(text.split())
+    for words, name, step, sources in (
+        (r"embeddings know ([0-9.]+) on `wall` then, ([0-9.]+) with obstacles hidden", "wall", 12, "embedding hidden"),
+        (r"is open \(([0-9.]+)\) and the body knows nothing \((-?[0-9.]+)\)", "wall_sense", 6, "embedding own"),
+    ):
+        (stated,) = re.findall(words, said)
+        row = known[f"{name}_softgm"][step]
+        assert stated == tuple(f"{row[source]:.2f}" for source in sources.split())
 
 
 def test_a_readout_explains_what_is_linear_and_nothing_of_what_is_random():
@@ -154,6 +160,7 @@ def test_no_kept_policy_names_a_folder_of_the_machine_that_trained_it():
         ("trials/wall/envs-128_promote-0.5_entropy-0.003/policy-2400000", 2_400_000, "gamma 0.95"),
         ("campaign/wall/softgm/seed0/evaluations", 3_001_600, "gamma 0.98"),
         ("campaign/wall_touch/softgm/seed0/evaluations", 3_001_600, "`wall_touch`"),
+        ("campaign/wall_sense/softgm/seed0/evaluations", 3_001_600, "`wall_sense`"),
     ],
 )
 def test_a_kept_policy_is_that_of_its_evaluations_and_the_page_says_what_they_hold(results, evaluations, frames, name):
@@ -220,6 +227,35 @@ def test_what_is_said_of_bumping_is_what_the_committed_curves_and_episodes_hold(
     assert contact == [f"{(touched <= steps).mean():.2f}" for steps in (0, 1, 2, 3, 5, 10)]
 
 
+SENSING = {"SoftGM": "softgm", "SoftGM without stage 1": "softgm_no_stage1"}  # rows of the page: folders
+
+
+@pytest.mark.parametrize("name", SENSING)
+def test_the_curves_of_the_choice_that_has_to_be_sensed_are_those_of_the_committed_runs(name, results):
+    page = results.PAGE.read_text().partition("### A choice that has to be sensed")[2].partition("\n### ")[0]
+    folder = ROOT / "experiments/campaign/wall_sense" / SENSING[name] / "seed0"
+    lines = [json.loads(line) for line in (folder / "evaluations.jsonl").read_text().splitlines()]
+    reached = {round(4 * line["frames"] / 1e6) / 4: f"{line['success_rate']['mean']:.2f}" for line in lines}
+    row = re.search(rf"^\| {name} \|(.*)\|$", page, re.MULTILINE)[1]
+    assert [cell.strip() for cell in row.split("|")] == [
+        reached[frames] for frames in (0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0)
+    ]
+
+
+def test_what_is_said_of_the_choice_that_has_to_be_sensed_is_what_the_committed_runs_hold(results):
+    page = " ".join(results.PAGE.read_text().split())
+    folders = [ROOT / "experiments/campaign/wall_sense" / label / "seed0" for label in SENSING.values()]
+    whole, blind = (json.loads((folder / "summary.json").read_text())["final_evaluation"] for folder in folders)
+    told = ["{mean:.3f} [{low:.3f}, {high:.3f}]".format(**one["success_rate"]) for one in (whole, blind)]
+    assert f"**SoftGM {told[0]}, without stage 1 {told[1]}**" in page
+    failures = round(blind["episodes"] * (1.0 - blind["success_rate"]["mean"]))
+    assert f"({blind['motionless_failures']} of its {failures} failures; none is of contact" in page
+    assert blind["contact_failure"] == 0
+    scenes = [results.episodes_in(folder / "evaluations")["none"]["success"] for folder in folders]
+    split = mcnemar(*scenes)
+    assert f"the same 500 scenes give {scenes[1].mean():.3f} ({split.lost} lost and {split.won} won against" in page
+
+
 KNOWING = {  # rows of the page: the trial whose curve each shows
     "whole, sensing from 0.15 m": "wall_touch/contact-2_fail-40",
     "without stage 1": "wall_touch/contact-2_fail-40_no-stage1",
@@ -228,8 +264,6 @@ KNOWING = {  # rows of the page: the trial whose curve each shows
     "without stage 1, told where the opening is": "wall_touch/contact-2_fail-40_sense-0.25_oracle",
     "without stage 1, told which": "wall_decoy/closed_contact-5_sense-0.25_oracle",
     "without stage 1, not told": "wall_decoy/closed_contact-5_sense-0.25_blind",
-    "whole": "wall_sense/softgm",
-    "blind, without stage 1": "wall_sense/softgm_no_stage1",
 }
 
 
