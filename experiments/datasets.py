@@ -28,11 +28,12 @@ from softgm_bench.storage.versions import versions
 ROOT = Path(__file__).parents[1]
 FOLDER = Path("experiments/datasets")  # in the repository, where this is run
 POLICIES = "experiments/policies"
+EARLIER = "experiments/trained/wall/softgm/seed0/policy.pt"  # acts in the same task as the former
 PAGE = ROOT / "docs" / "datasets.md"
 PURPOSE = "'to try offline learning and loaders of TorchRL in seconds; too small to learn a wall from'"
 SETS = {
     "basic": [f"policies=[random,{POLICIES}/basic_iddpg.pt,{POLICIES}/basic_softgm.pt]", "transitions=3600"],
-    "wall": [f"policies=[random,{POLICIES}/wall_mappo.pt,{POLICIES}/wall_softgm.pt]", "transitions=3300"],
+    "wall": [f"policies=[random,{POLICIES}/wall_mappo.pt,{EARLIER}]", "transitions=3300"],
 }
 COMMON = ["shares=[1,1,2]", "horizon=100", "batch=32", f"purpose={PURPOSE}"]
 ORIGINAL = "softgm"

@@ -45,7 +45,10 @@ def test_torchrl_alone_goes_once_through_a_released_chunk(name):
 
 
 def replay(data, policy, part):
-    """Give a part's recorded actions to the environment with its seed; compares every step of its episodes."""
+    """Give a part's recorded actions to the environment with its seed; compares every step of its episodes.
+
+    Another processor than the one that recorded rounds differently in the last digits.
+    """
     chosen = np.flatnonzero((data.episodes["policy"] == policy) & (data.episodes["part"] == part))
     seed, batch = int(data.episodes["seed"][chosen[0]]), data.settings["batch"]
     env = data.make_env(batch, seed)
@@ -65,7 +68,14 @@ def replay(data, policy, part):
         told = torch.stack([own[number][step] for number in going])
         for key, value in told.items(include_nested=True, leaves_only=True):
             if key not in (layout.EPISODE, layout.POLICY):
-                assert torch.equal(value, frame[key][at]), (step, key)
+                exactly = not value.is_floating_point()
+                torch.testing.assert_close(
+                    frame[key][at],
+                    value,
+                    rtol=0.0 if exactly else 1e-4,
+                    atol=0.0 if exactly else 1e-5,
+                    msg=lambda text, step=step, key=key: f"{key} after {step} steps: {text}",
+                )
         compared += len(going)
         frame = step_mdp(frame)
     assert compared == data.episodes["length"][chosen].sum()
@@ -73,13 +83,13 @@ def replay(data, policy, part):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_recorded_actions_give_the_recorded_digits_again(name, one_thread):
+def test_recorded_actions_give_the_recorded_steps_again(name, one_thread):
     assert replay(load(FOLDER / name), policy=2, part=0) > 500
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
-def test_all_recorded_actions_give_the_recorded_digits_again(name, one_thread):
+def test_all_recorded_actions_give_the_recorded_steps_again(name, one_thread):
     data = load(FOLDER / name)
     parts = sorted(set(zip(data.episodes["policy"].tolist(), data.episodes["part"].tolist(), strict=True)))
     assert sum(replay(data, *part) for part in parts) == data.transitions
