@@ -35,8 +35,17 @@ def batch(backend: str, group: int) -> dict[str, dict[str, Array]]:
     return our_trajectories(backend, list(together(CASES))[group])
 
 
-@pytest.mark.parametrize("name", CASES)
-@pytest.mark.parametrize("backend", CPU_BACKENDS)
+FREE_AND_TOUCHING = ("20 elements", "20 elements, one post", "wall, friction")  # the quick tier's, of the slow backend
+EVERY = [
+    pytest.param(backend, name, marks=pytest.mark.slow)
+    if backend == "torch" and name not in FREE_AND_TOUCHING
+    else (backend, name)
+    for backend in CPU_BACKENDS
+    for name in CASES
+]
+
+
+@pytest.mark.parametrize(("backend", "name"), EVERY)
 def test_trajectory_equals_pyelastica(backend: str, name: str):
     group = next(i for i, cases in enumerate(together(CASES)) if name in cases)
     ours = batch(backend, group)[name]
