@@ -28,7 +28,7 @@ from softgm_bench.storage.versions import versions
 ROOT = Path(__file__).parents[1]
 FOLDER = Path("experiments/datasets")  # in the repository, where this is run
 POLICIES = "experiments/policies"
-EARLIER = "experiments/trained/wall/softgm/seed0/policy.pt"  # acts in the same task as the former
+EARLIER = "experiments/trained/wall/softgm/seed0/policy.pt"  # acts in the task of wall_mappo.pt
 PAGE = ROOT / "docs" / "datasets.md"
 PURPOSE = "'to try offline learning and loaders of TorchRL in seconds; too small to learn a wall from'"
 SETS = {

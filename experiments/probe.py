@@ -18,6 +18,7 @@ from torch import Tensor
 
 from softgm_bench import api
 from softgm_bench.analysis.markdown import refilled
+from softgm_bench.assembly import build_env
 from softgm_bench.envs import entries
 from softgm_bench.episodes.interventions import blind
 from softgm_bench.episodes.policy import TrainedPolicy, fingerprint, load
@@ -88,7 +89,7 @@ def features(trained: TrainedPolicy, frame: TensorDictBase) -> dict[str, Tensor]
 
 def play(trained: TrainedPolicy) -> list[dict[str, float]]:
     """One row for each of ``STEPS``: how many episodes go on then, and what can be read out of them."""
-    env = api.build_env(trained.config, EPISODES, SEED)
+    env = build_env(trained.config, EPISODES, SEED)
     frames = api.rollout(env, trained, max(STEPS) + 1)
     ended = frames["next", "done"].squeeze(-1).cumsum(1) > 0
     rows = []

@@ -203,6 +203,13 @@ def test_what_the_walls_recipe_reached_is_its_runs_own_final_evaluation(results)
     assert told in " ".join(results.PAGE.read_text().split())
 
 
+def reached(folder):
+    """Success of a run after a quarter of a million frames and so on, as curves on the page have it."""
+    lines = [json.loads(line) for line in (folder / "evaluations.jsonl").read_text().splitlines()]
+    success = {round(4 * line["frames"] / 1e6) / 4: f"{line['success_rate']['mean']:.2f}" for line in lines}
+    return [success[frames] for frames in (0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0)]
+
+
 BUMPING = {  # rows of the page: the run whose curve it shows, and the evaluation whose contact it counts
     "SoftGM": ("campaign/wall_touch/softgm/seed0", "evaluations/none"),
     "SoftGM without stage 1": ("campaign/wall_touch/softgm_no_stage1/seed0", "evaluations/none"),
@@ -216,11 +223,7 @@ def test_what_is_said_of_bumping_is_what_the_committed_curves_and_episodes_hold(
     curve, contact = (
         [cell.strip() for cell in row.split("|")[2:-1]] for row in re.findall(rf"^\| {name}(?: \||,).*", page, re.M)
     )
-    lines = [json.loads(line) for line in (ROOT / "experiments" / run / "evaluations.jsonl").read_text().splitlines()]
-    reached = {round(4 * line["frames"] / 1e6) / 4: f"{line['success_rate']['mean']:.2f}" for line in lines}
-    assert [cell for cell in curve if cell] == [
-        reached[frames] for frames in (0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0) if frames in reached
-    ]
+    assert curve == reached(ROOT / "experiments" / run)
     with (ROOT / "experiments" / run / evaluation / "episodes.csv").open() as file:
         episodes = list(csv.DictReader(file))
     touched = np.array([int(row["contact_steps"]) if row["success"] == "True" else np.inf for row in episodes])
@@ -234,12 +237,8 @@ SENSING = {"SoftGM": "softgm", "SoftGM without stage 1": "softgm_no_stage1"}  # 
 def test_the_curves_of_the_choice_that_has_to_be_sensed_are_those_of_the_committed_runs(name, results):
     page = results.PAGE.read_text().partition("### A choice that has to be sensed")[2].partition("\n### ")[0]
     folder = ROOT / "experiments/campaign/wall_sense" / SENSING[name] / "seed0"
-    lines = [json.loads(line) for line in (folder / "evaluations.jsonl").read_text().splitlines()]
-    reached = {round(4 * line["frames"] / 1e6) / 4: f"{line['success_rate']['mean']:.2f}" for line in lines}
     row = re.search(rf"^\| {name} \|(.*)\|$", page, re.MULTILINE)[1]
-    assert [cell.strip() for cell in row.split("|")] == [
-        reached[frames] for frames in (0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0)
-    ]
+    assert [cell.strip() for cell in row.split("|")] == reached(folder)
 
 
 def test_what_is_said_of_the_choice_that_has_to_be_sensed_is_what_the_committed_runs_hold(results):

@@ -2,6 +2,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rounding import assert_equal_to_rounding
 
 from softgm_bench.models import chain_kernel
 from softgm_bench.models.chain_kernel import ChainAttention
@@ -34,10 +35,7 @@ def test_it_equals_the_tensor_operations_forward_and_backward(graphs, n_agents, 
         out, weights = layer.chain(layer.project(inputs, layer.joint_weight()), n_agents)
         (out * torch.arange(1.0, 1.0 + out.shape[1], dtype=dtype)).square().sum().backward()
         results.append([out, weights, inputs.grad, *(parameter.grad.clone() for parameter in layer.parameters())])
-    # small gradients are sums of large terms, so that rounding goes with the largest number anywhere
-    scale = max(1.0, *(plain.abs().max().item() for plain in results[1]))
-    for compiled, plain in zip(*results, strict=True):
-        torch.testing.assert_close(compiled, plain, rtol=0.0, atol=50 * torch.finfo(dtype).eps * scale)
+    assert_equal_to_rounding(*results)
 
 
 def test_the_layer_takes_the_kernel_on_a_cpu_and_only_for_the_papers_scores(monkeypatch):

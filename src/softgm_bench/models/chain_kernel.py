@@ -6,9 +6,11 @@ through while they lie in the cache. Scores and softmax, a number per head each,
 """
 
 import math
+from collections.abc import Iterable
 from typing import Any
 
 import numba
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -76,6 +78,11 @@ def dot(one, other):
     return total
 
 
+def arrays(tensors: Iterable[Tensor]) -> list[np.ndarray]:
+    """The memory of tensors on the CPU, for compiled loops."""
+    return [tensor.numpy() for tensor in tensors]
+
+
 class ChainAttention(torch.autograd.Function):
     """``apply(values, N, H, slope)``: new agents ``(T, H C)`` before the bias and weights ``(3, T, H)``.
 
@@ -89,7 +96,7 @@ class ChainAttention(torch.autograd.Function):
         out = values.new_empty(len(values), values.shape[1] - 2 * n_heads)
         pairs = _pairs(values, n_agents, n_heads)
         weights = functional.leaky_relu(pairs, slope).softmax(dim=0)
-        aggregate(values.numpy(), weights.numpy(), n_agents, out.numpy())
+        aggregate(*arrays((values, weights)), n_agents, *arrays((out,)))
         ctx.save_for_backward(values, pairs, weights)
         ctx.n_agents, ctx.n_heads, ctx.slope = n_agents, n_heads, slope
         ctx.mark_non_differentiable(weights)
@@ -101,8 +108,7 @@ class ChainAttention(torch.autograd.Function):
         values, pairs, weights = ctx.saved_tensors
         of_values, of_weights = torch.zeros_like(values), torch.zeros_like(weights)
         gradient = gradients[0].contiguous()
-        arrays = (tensor.numpy() for tensor in (values, weights, gradient))
-        differentiate(*arrays, ctx.n_agents, of_values.numpy(), of_weights.numpy())
+        differentiate(*arrays((values, weights, gradient)), ctx.n_agents, *arrays((of_values, of_weights)))
         of_scores = weights * (of_weights - (weights * of_weights).sum(0))
         of_pairs = torch.where(pairs < 0.0, ctx.slope * of_scores, of_scores)
 

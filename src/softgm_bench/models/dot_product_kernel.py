@@ -10,11 +10,10 @@ import math
 from typing import Any
 
 import numba
-import numpy as np
 import torch
 from torch import Tensor
 
-from softgm_bench.models.chain_kernel import FAST, add_scaled, dot
+from softgm_bench.models.chain_kernel import FAST, add_scaled, arrays, dot
 from softgm_bench.rod.compiling import njit
 
 
@@ -147,7 +146,7 @@ class DotProductAttention(torch.autograd.Function):
         of_agents = agents.new_zeros(len(agents), n_heads, sizes[0])
         of_bins, out = agents.new_empty(len(far), n_heads), torch.empty_like(agents[:, 0])
         pooled = agents.new_empty(len(agents), n_heads)
-        gather(*_arrays(tensors), sizes, *_arrays([of_agents, of_bins, out, pooled]))
+        gather(*arrays(tensors), sizes, *arrays([of_agents, of_bins, out, pooled]))
         ctx.save_for_backward(*tensors, of_agents, of_bins)
         ctx.sizes = sizes
         ctx.mark_non_differentiable(of_agents, of_bins)
@@ -157,11 +156,7 @@ class DotProductAttention(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> Any:
         """The gradients with respect to the first five arguments."""
         *tensors, of_agents, of_bins = ctx.saved_tensors
-        results = tuple(_arrays([gradient.contiguous() for gradient in gradients[:2]]))
+        results = tuple(arrays([gradient.contiguous() for gradient in gradients[:2]]))
         found = [torch.zeros_like(tensor) for tensor in tensors[:5]]
-        differentiate(*_arrays(tensors), ctx.sizes, *_arrays([of_agents, of_bins]), results, tuple(_arrays(found)))
+        differentiate(*arrays(tensors), ctx.sizes, *arrays([of_agents, of_bins]), results, tuple(arrays(found)))
         return *found, None, None, None
-
-
-def _arrays(tensors: list[Tensor]) -> list[np.ndarray]:
-    return [tensor.numpy() for tensor in tensors]

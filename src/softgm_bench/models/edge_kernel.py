@@ -9,16 +9,14 @@ environments, K nodes those that some agent senses, E edges go from nodes to age
 """
 
 import math
-from collections.abc import Iterable
 from typing import Any
 
 import numba
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from softgm_bench.models.chain_kernel import FAST, add_scaled, dot
+from softgm_bench.models.chain_kernel import FAST, add_scaled, arrays, dot
 from softgm_bench.rod.compiling import njit
 
 
@@ -130,8 +128,8 @@ class EdgeAttention(torch.autograd.Function):
         slope = own.numpy().dtype.type(slope)
         own_weights, weights = torch.empty_like(own), own.new_empty(len(source), own.shape[1])
         mixed = own.new_empty(*own.shape, nodes.shape[1])
-        inputs = _arrays((nodes, sources, targets, own, first, source))
-        mix(*inputs, n_agents, slope, *_arrays((own_weights, weights, mixed)))
+        inputs = arrays((nodes, sources, targets, own, first, source))
+        mix(*inputs, n_agents, slope, *arrays((own_weights, weights, mixed)))
         ctx.save_for_backward(nodes, sources, targets, own, rows, first, source, own_weights, weights)
         ctx.n_agents, ctx.slope, ctx.has_offset = n_agents, slope, offset is not None
         ctx.mark_non_differentiable(weights)
@@ -141,15 +139,11 @@ class EdgeAttention(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> Any:
         """The gradients with respect to the first five arguments."""
         tensors = ctx.saved_tensors
-        *inputs, rows, first, source, own_weights, weights = _arrays(tensors)
-        results = tuple(_arrays(gradient.contiguous() for gradient in gradients[:2]))
+        *inputs, rows, first, source, own_weights, weights = arrays(tensors)
+        results = tuple(arrays(gradient.contiguous() for gradient in gradients[:2]))
         found = [torch.empty_like(tensor) for tensor in tensors[:4]]
         edges = (rows, first, source, ctx.n_agents, ctx.slope)
-        differentiate(tuple(inputs), *edges, own_weights, weights, results, tuple(_arrays(found)))
+        differentiate(tuple(inputs), *edges, own_weights, weights, results, tuple(arrays(found)))
         of_nodes, of_sources, *others = found
         of_offset = of_sources.sum(0) if ctx.has_offset else None
         return of_nodes, of_sources.mT @ tensors[0], of_offset, *others, None, None, None, None
-
-
-def _arrays(tensors: Iterable[Tensor]) -> list[np.ndarray]:
-    return [tensor.numpy() for tensor in tensors]
