@@ -84,8 +84,11 @@ def written(card: Card) -> str:
 def command(card: Card) -> str:
     """Give the command that trained a policy of the campaign, which asks for nothing but its cell and its machine."""
     run = card.trained.run
-    named = f"algo={run.algo.name} task={run.task.name} seed={run.seed} threads={run.threads} matmul={run.matmul}"
-    return f"python -m softgm_bench {named}"
+    memory = getattr(run.algo.actor, "memory", None)
+    words = {"algo": run.algo.name, "model": run.model.name, "observation": run.observation, "task": run.task.name}
+    words |= {} if memory is None else {"'algo.actor.memory": f"{{cell:{memory.cell},size:{memory.size}}}'"}
+    words |= {"seed": run.seed, "threads": run.threads, "matmul": run.matmul}
+    return " ".join(["python -m softgm_bench", *(f"{key}={value}" for key, value in words.items())])
 
 
 def page() -> str:
