@@ -63,6 +63,19 @@ def test_only_the_tuned_recipe_has_what_walls_need_and_only_on_walls():
             )
 
 
+@pytest.mark.parametrize("algo", ["ippo", "mappo"])
+def test_on_walls_mlps_learn_in_large_steps_and_graph_networks_in_small_ones(algo):
+    for model, expected in (
+        ("mlp", (512, 1280, 0.95, 0.0, False, 200, 0.6)),
+        ("softgm", (128, 800, 0.98, 0.003, True, 60, 0.5)),
+    ):
+        config = compose(["task=wall", f"algo={algo}", f"model={model}"])
+        learner, experiment = config.algo, config.experiment
+        found = (experiment.num_envs, learner.minibatch_size, learner.gamma, learner.entropy_coeff)
+        found += (learner.actor.embedding_norm, experiment.train_horizon, config.task.curriculum.promote)
+        assert found == expected
+
+
 @pytest.mark.parametrize("recipe", ["paper", "tuned"])
 @pytest.mark.parametrize("algo", algorithm_configs())
 def test_no_independent_critic_is_told_what_is_hidden(algo, recipe):

@@ -41,6 +41,14 @@ def test_a_value_depends_on_whether_the_task_hides_something():
     assert resolved("${if_hidden:1, 2}", task={"name": "mine"}) == 2
 
 
+@pytest.mark.parametrize(
+    ("hidden", "model", "expected"), [(True, "softgm", 1), (True, "mlp", 2), (False, "softgm", 2), (False, "mlp", 2)]
+)
+def test_only_networks_other_than_mlps_learn_what_is_hidden_in_small_steps(hidden, model, expected):
+    task = {"name": "mine", "hidden_scene": hidden}
+    assert resolved("${in_small_steps:1, 2}", task=task, model={"name": model}) == expected
+
+
 def test_a_value_depends_on_whether_numbers_of_sections_are_mixed():
     assert resolved("${if_mixture:1, 2}", task={"n_agents": [4]}) == 1
     assert resolved("${if_mixture:1, 2}", task={"n_agents": 4}) == 2

@@ -34,6 +34,15 @@ def if_hidden(hidden: Any, plain: Any, *, _root_: DictConfig) -> Any:
     return _node(hidden if OmegaConf.select(_root_, "task.hidden_scene") else plain)
 
 
+def in_small_steps(small: Any, large: Any, *, _root_: DictConfig) -> Any:
+    """The first value where the tuned recipe learns in small iterations, the second elsewhere.
+
+    Small ones are for what has to be found out (``task.hidden_scene``), by any network but an MLP (``model.name``).
+    """
+    searches = OmegaConf.select(_root_, "task.hidden_scene") and OmegaConf.select(_root_, "model.name") != "mlp"
+    return _node(small if searches else large)
+
+
 def if_mixture(mixture: Any, one: Any, *, _root_: DictConfig) -> Any:
     """The first value where ``task.n_agents`` is a list of numbers, the second where it is a number."""
     return _node(mixture if OmegaConf.is_list(OmegaConf.select(_root_, "task.n_agents")) else one)
@@ -68,6 +77,6 @@ def _node(value: Any) -> Any:
 
 def register() -> None:
     """Let YAML call the functions above by their names."""
-    choices = (tuned_or_paper, on_or_off_policy, if_centralised, if_hidden, if_mixture, in_smoke, in_gpu)
-    for resolver in (*choices, first, label):
+    by_kind = (tuned_or_paper, on_or_off_policy, if_centralised, if_hidden, in_small_steps, if_mixture)
+    for resolver in (*by_kind, in_smoke, in_gpu, first, label):
         OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)
