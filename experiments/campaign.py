@@ -24,6 +24,7 @@ GRIDS = {  # the settings of each
     "table1": ("+grids=table1",),
     "ablation": ("+grids=ablation",),
     "ladder": (LADDER,),
+    "ladder, MLP": (LADDER, "algo=mappo", "model=mlp"),
     "ladder, recurrent": (LADDER, "model=softgm", "algo.actor.memory={cell:gru,size:128}"),
     "ladder, oracle": (LADDER, "model=softgm", "observation=oracle"),
     "rivals": ("+grids=rivals",),

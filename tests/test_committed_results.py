@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from omegaconf import OmegaConf
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from softgm_bench.analysis.statistics import mcnemar
@@ -387,6 +388,27 @@ def test_a_kept_policy_still_reaches_targets(algo):
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         episodes = env.rollout(100, trained.policy, break_when_any_done=False)
     assert episodes["next"][entries.SUCCESS].any(dim=1).double().mean() > 0.85
+
+
+def test_the_curves_of_what_was_tried_are_those_of_the_committed_runs():
+    trials = script(ROOT / "experiments" / "trials.py")
+    text = trials.PAGE.read_text()
+    assert trials.page(text) == text
+    whole = trials.curve(trials.EXPERIMENTS / "campaign/wall/softgm/seed0")
+    assert list(whole) == list(range(1, 13))
+
+
+def test_mlps_on_walls_have_the_settings_of_the_run_whose_recipe_they_are_said_to_have(results):
+    now = compose(["task=wall", "algo=mappo"])
+    (run,) = [run for run in results.runs("wall") if run.final.label == "mappo"]
+    then = run.config
+    for key in ("num_envs", "steps_per_batch", "train_horizon"):
+        assert getattr(now.experiment, key) == then["experiment"][key]
+    learner = OmegaConf.to_container(OmegaConf.structured(now.algo))
+    for key, value in then["algo"].items():
+        held = learner[key]
+        assert ({name: held[name] for name in value} if isinstance(value, dict) else held) == value, key
+    assert now.task.curriculum.promote == then["task"]["curriculum"]["promote"]
 
 
 def test_what_is_said_of_a_mixture_of_sections_is_what_was_played():

@@ -88,6 +88,8 @@ def test_the_ladder_goes_from_blind_to_told_and_shares_the_wholes_runs():
     assert len(sweep.cells(["+grids=ladder"])[0]) == 36
     rungs = [str(cell.run_dir) for cell in sweep.cells(["+grids=ladder", "seed=1", "task=wall"])[0]]
     assert rungs == [f"outputs/full/wall/{name}/seed1" for name in ("softgm_no_stage1", "softgm", "softgm_remember")]
+    table, _ = sweep.cells(["+grids=ladder", "seed=1", "task=wall", "algo=mappo", "model=mlp"])
+    assert [str(cell.run_dir) for cell in table] == ["outputs/full/wall/mappo/seed1"]
     told, _ = sweep.cells(["+grids=ladder", "seed=1", "task=wall", "model=softgm", "observation=oracle"])
     assert [str(cell.run_dir) for cell in told] == ["outputs/full/wall/softgm_oracle/seed1"]
     recurrent, _ = sweep.cells(["+grids=ladder", "seed=1", "model=softgm", "algo.actor.memory={cell:gru,size:128}"])
