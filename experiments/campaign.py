@@ -1,18 +1,23 @@
 """Tables of the campaign, whose cells are those of the published grids: ``python experiments/campaign.py``.
 
 A finished cell lies in ``experiments/campaign/<task>/<algorithm>/seed<seed>/`` as its run left it, without checkpoints.
-Rewrites the two tables in ``docs/results.md``: every run with its budget, and every cell of the grids, with what is
-missing. A run counts only if it has the frames, the final episodes and the recipe that its grid asks for.
+Rewrites three tables in ``docs/results.md``: every run with its budget, every cell of the grids, with what is missing,
+and the paper's Table II, from the evaluations in a cell's folder ``robustness``. A run counts only if it has the
+frames, the final episodes and the recipe that its grid asks for.
 """
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+from softgm_bench.analysis import paper
 from softgm_bench.analysis.markdown import refilled
 from softgm_bench.analysis.runs import Run, find
+from softgm_bench.analysis.statistics import mcnemar
 from softgm_bench.config import compose
+from softgm_bench.episodes.summary import wilson_interval
 from softgm_bench.errors import UserError
 from softgm_bench.sweeps import launch
 
@@ -33,6 +38,16 @@ MISSING = "–"
 RUNS = (
     "| task | algorithm | seed | frames | minutes | success | 95 % interval | episodes | within 400 steps | motionless "
     "| torque, joint |"
+)
+CONDITIONS = {  # rows of the table of perturbations: what ``softgm_bench.evaluate`` calls them
+    "nominal": "none",
+    "noise": "noise",
+    "section failure": "section_failure",
+    "disturbance": "disturbance",
+}
+PERTURBED = (
+    "| policy | condition | success | 95 % interval | within 400 steps | mean length | lost, won | p "
+    "| the paper's success |"
 )
 
 
@@ -118,6 +133,39 @@ def cell_table() -> str:
     return "\n".join([*lines, "", f"{total}: {', '.join(counts)} (some cells are of several grids)."])
 
 
+def perturbation_table() -> str:
+    """Success of policies under perturbations that they were not trained under, each beside the same scenes without."""
+    lines = [PERTURBED, "|" + " --- |" * (PERTURBED.count("|") - 1)]
+    for run in runs().values():
+        folder = ROOT / "experiments" / run.final.folder / "robustness"
+        if not folder.is_dir():
+            continue
+        played = {one.folder.rpartition("/")[2]: one.episodes for one in find(folder).evaluations}
+        usual = played["none"]["success"]
+        for row, name in CONDITIONS.items():
+            success, length = played[name]["success"], played[name]["length"]
+            low, high = wilson_interval(int(success.sum()), len(success))
+            split = mcnemar(usual, success)
+            theirs = paper.table_two(run.final.task, run.final.label, name)
+            cells = (
+                f"`{run.final.task}`, {run.final.label}, seed {run.final.seed}",
+                row,
+                f"{success.mean():.3f}",
+                f"[{low:.3f}, {high:.3f}]",
+                f"{(success * (length <= 400)).mean():.3f}",
+                f"{length.mean():.0f}",
+                "" if name == "none" else f"{split.lost}, {split.won}",
+                "" if name == "none" else _rounded(split.p),
+                MISSING if theirs is None else f"{theirs.success_rate / 100.0:.3f}",
+            )
+            lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _rounded(p: float) -> str:
+    return f"{p:.2g}" if p > 1e-3 else f"< 1e{math.ceil(math.log10(p)):d}"
+
+
 def _seeds(folders: Iterable[str]) -> str:
     """Success of the seeds of one cell of the table, in their order."""
     found = [runs().get(folder) for folder in folders]
@@ -131,8 +179,9 @@ def _there(folders: Sequence[str]) -> int:
 
 
 def page(text: str) -> str:
-    """``docs/results.md`` with both tables made anew."""
-    return refilled(PAGE, text, {"campaign runs": run_table(), "campaign cells": cell_table()})
+    """``docs/results.md`` with its tables made anew."""
+    tables = {"campaign runs": run_table(), "campaign cells": cell_table(), "perturbations": perturbation_table()}
+    return refilled(PAGE, text, tables)
 
 
 def main() -> None:

@@ -69,6 +69,21 @@ def test_every_run_of_the_campaign_is_a_cell_at_its_budget_and_the_page_names_wh
     assert f"{len(wanted) - len(missing)} of {len(wanted)} cells are there" in table
 
 
+def test_perturbed_and_nominal_episodes_are_of_one_policy_and_differ_in_the_perturbation_alone(campaign):
+    folders = list(campaign.CAMPAIGN.glob("*/*/*/robustness"))
+    assert folders
+    for folder in folders:
+        played = [json.loads((folder / name / "summary.json").read_text()) for name in campaign.CONDITIONS.values()]
+        names = [summary.pop("perturbation", {"name": "none"})["name"] for summary in played]
+        assert names == list(campaign.CONDITIONS.values())
+        for summary in played:
+            assert summary.pop("metrics")["episodes"] == 1000
+            summary.pop("overrides")
+            assert summary == played[0]
+        assert played[0]["policy"] == policy.fingerprint(policy.load(folder.with_name("policy.pt")))
+        assert (played[0]["horizon"], played[0]["intervention"]) == (2000, "none")
+
+
 def test_the_cells_of_a_task_have_equal_budgets_whatever_the_algorithm(campaign):
     for run in campaign.runs().values():
         settings = campaign.asked(run.final.task)
