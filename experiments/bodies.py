@@ -16,11 +16,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from softgm_bench.analysis.markdown import refilled
-from softgm_bench.analysis.statistics import mcnemar
+from softgm_bench.analysis.markdown import compared, refilled
 from softgm_bench.episodes import folder, policy
 from softgm_bench.episodes.protocol import Protocol
-from softgm_bench.episodes.summary import wilson_interval
 from softgm_bench.errors import UserError
 from softgm_bench.rod.randomise import FACTORS
 from softgm_bench.runs.machine import set_threads
@@ -103,10 +101,7 @@ def table() -> str:
         for bodies in BODIES:
             one = columns(subject, bodies)
             success = one["success"]
-            low, high = wilson_interval(int(success.sum()), len(success))
-            split = mcnemar(nominal, success)
-            cells = [subject, f"`{bodies}`", f"{success.mean():.3f}", f"[{low:.3f}, {high:.3f}]"]
-            cells += ["-", "-"] if bodies == "none" else [f"{split.lost}, {split.won}", f"{split.p:.1g}"]
+            cells = [subject, f"`{bodies}`", *compared(success, None if bodies == "none" else nominal)]
             cells += [f"{one['length'][success == 1].mean():.0f}", f"{one['diverged'].sum():.0f}"]
             lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)

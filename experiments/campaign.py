@@ -6,18 +6,15 @@ and the paper's Table II, from the evaluations in a cell's folder ``robustness``
 frames, the final episodes and the recipe that its grid asks for.
 """
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 from softgm_bench.analysis import paper
-from softgm_bench.analysis.markdown import refilled
-from softgm_bench.analysis.runs import Run, find
-from softgm_bench.analysis.statistics import mcnemar
+from softgm_bench.analysis.markdown import compared, refilled
+from softgm_bench.analysis.runs import Found, Run, find
 from softgm_bench.config import compose
-from softgm_bench.episodes.summary import wilson_interval
 from softgm_bench.errors import UserError
 from softgm_bench.sweeps import launch
 
@@ -46,7 +43,7 @@ CONDITIONS = {  # rows of the table of perturbations: what ``softgm_bench.evalua
     "disturbance": "disturbance",
 }
 PERTURBED = (
-    "| policy | condition | success | 95 % interval | within 400 steps | mean length | lost, won | p "
+    "| policy | condition | success | 95 % interval | lost, won | p | within 400 steps | mean length "
     "| the paper's success |"
 )
 
@@ -68,17 +65,27 @@ def asked(task: str) -> Mapping[str, Any]:
 
 
 @cache
+def committed(folder: Path) -> Found:
+    """Whatever runs and evaluations lie in a folder.
+
+    Raises:
+        SystemExit: a folder that holds no whole run or evaluation.
+    """
+    found = find(folder)
+    if found.problems:
+        raise SystemExit(f"{found.problems[0].folder}: {found.problems[0].reason}")
+    return found
+
+
+@cache
 def runs() -> Mapping[str, Run]:
     """All finished cells by their folders.
 
     Raises:
         SystemExit: a folder that holds no whole run, or another one than its name says, or one that is no cell.
     """
-    found = find(CAMPAIGN)
-    if found.problems:
-        raise SystemExit(f"{found.problems[0].folder}: {found.problems[0].reason}")
     wanted = {cell for grid in GRIDS for cell in cells(grid)}
-    by_folder = {run.final.folder.partition("/")[2]: run for run in found.runs}
+    by_folder = {run.final.folder.partition("/")[2]: run for run in committed(CAMPAIGN).runs}
     for folder, run in by_folder.items():
         final, settings = run.final, asked(run.final.task)
         if folder != f"{final.task}/{final.label}/seed{final.seed}":
@@ -137,33 +144,25 @@ def perturbation_table() -> str:
     """Success of policies under perturbations that they were not trained under, each beside the same scenes without."""
     lines = [PERTURBED, "|" + " --- |" * (PERTURBED.count("|") - 1)]
     for run in runs().values():
-        folder = ROOT / "experiments" / run.final.folder / "robustness"
-        if not folder.is_dir():
-            continue
-        played = {one.folder.rpartition("/")[2]: one.episodes for one in find(folder).evaluations}
-        usual = played["none"]["success"]
-        for row, name in CONDITIONS.items():
+        folder = f"{run.final.folder}/robustness/"
+        played = {
+            one.folder.removeprefix(folder): one.episodes
+            for one in committed(CAMPAIGN).evaluations
+            if one.folder.startswith(folder)
+        }
+        for row, name in CONDITIONS.items() if played else ():
             success, length = played[name]["success"], played[name]["length"]
-            low, high = wilson_interval(int(success.sum()), len(success))
-            split = mcnemar(usual, success)
             theirs = paper.table_two(run.final.task, run.final.label, name)
             cells = (
                 f"`{run.final.task}`, {run.final.label}, seed {run.final.seed}",
                 row,
-                f"{success.mean():.3f}",
-                f"[{low:.3f}, {high:.3f}]",
+                *compared(success, None if name == "none" else played["none"]["success"]),
                 f"{(success * (length <= 400)).mean():.3f}",
                 f"{length.mean():.0f}",
-                "" if name == "none" else f"{split.lost}, {split.won}",
-                "" if name == "none" else _rounded(split.p),
                 MISSING if theirs is None else f"{theirs.success_rate / 100.0:.3f}",
             )
             lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
-
-
-def _rounded(p: float) -> str:
-    return f"{p:.2g}" if p > 1e-3 else f"< 1e{math.ceil(math.log10(p)):d}"
 
 
 def _seeds(folders: Iterable[str]) -> str:

@@ -4,6 +4,7 @@ Each policy is the actor of a run whose data are committed; what its card says i
 """
 
 import os
+import shlex
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -86,9 +87,9 @@ def command(card: Card) -> str:
     run = card.trained.run
     memory = getattr(run.algo.actor, "memory", None)
     words = {"algo": run.algo.name, "model": run.model.name, "observation": run.observation, "task": run.task.name}
-    words |= {} if memory is None else {"'algo.actor.memory": f"{{cell:{memory.cell},size:{memory.size}}}'"}
+    words |= {} if memory is None else {"algo.actor.memory": f"{{cell:{memory.cell},size:{memory.size}}}"}
     words |= {"seed": run.seed, "threads": run.threads, "matmul": run.matmul}
-    return " ".join(["python -m softgm_bench", *(f"{key}={value}" for key, value in words.items())])
+    return f"python -m softgm_bench {shlex.join(f'{key}={value}' for key, value in words.items())}"
 
 
 def page() -> str:

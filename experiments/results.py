@@ -11,11 +11,9 @@ from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
-from softgm_bench.analysis.markdown import refilled
+from softgm_bench.analysis.markdown import compared, refilled
 from softgm_bench.analysis.runs import Columns, Run, find
-from softgm_bench.analysis.statistics import mcnemar
 from softgm_bench.episodes import certified
-from softgm_bench.episodes.summary import wilson_interval
 from softgm_bench.errors import UserError
 
 ROOT = Path(__file__).parents[1]
@@ -142,10 +140,7 @@ def elsewhere(policies: Sequence[str], rows: Mapping[str, str]) -> str:
         cells = [row]
         for policy in policies:
             usual, other = (episodes_in(SECTIONS)[f"{policy}/{name}"]["success"] for name in (AS_TRAINED, folder))
-            low, high = wilson_interval(int(other.sum()), len(other))
-            cells += [f"{other.mean():.3f}", f"[{low:.3f}, {high:.3f}]"]
-            split = mcnemar(usual, other)
-            cells += ["-", "-"] if folder == AS_TRAINED else [f"{split.lost}, {split.won}", f"{split.p:.1g}"]
+            cells += compared(other, None if folder == AS_TRAINED else usual)
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from softgm_bench.analysis.document import Cell, Document, Figure, Table, written
+from softgm_bench.analysis.statistics import Array, mcnemar
 from softgm_bench.errors import UserError
 
 
@@ -29,6 +30,23 @@ def refilled(page: Path, text: str, tables: Mapping[str, str]) -> str:
         if count != 1:
             raise UserError(f"{page}: one place for the table of {name} expected, found {count}")
     return text
+
+
+def compared(success: Array, usual: Array | None) -> list[str]:
+    """Write success, its Wilson interval, scenes lost and won against the usual condition, and McNemar's exact p.
+
+    Args:
+        success: of a condition's episodes, 0 or 1, ``(episodes,)``.
+        usual: of the same scenes under the usual condition; None, for dashes, where ``success`` is that one.
+    """
+    from softgm_bench.episodes.summary import wilson_interval  # brings torch along
+
+    low, high = wilson_interval(int(success.sum()), len(success))
+    cells = [f"{success.mean():.3f}", f"[{low:.3f}, {high:.3f}]"]
+    if usual is None:
+        return [*cells, "-", "-"]
+    split = mcnemar(usual, success)
+    return [*cells, f"{split.lost}, {split.won}", f"{split.p:.1g}"]
 
 
 def _figure(figure: Figure) -> str:
