@@ -1,0 +1,125 @@
+"""What the results say of walls that have to be felt or sensed is what the committed runs hold."""
+
+import csv
+import json
+import re
+
+import numpy as np
+import pytest
+
+from committed import ROOT, script
+from softgm_bench.analysis.statistics import mcnemar
+from softgm_bench.episodes import certified
+
+
+@pytest.fixture(scope="module")
+def results():
+    return script(ROOT / "experiments" / "results.py")
+
+
+def reached(folder):
+    """Success of a run after a quarter of a million frames and so on, as curves on the page have it."""
+    found = script(ROOT / "experiments" / "trials.py").curve(folder)
+    return [f"{found[number]:.2f}" if number in found else "" for number in (1, 2, 3, 4, 5, 6, 8, 10, 12)]
+
+
+def row_of(page, name):
+    """Cells of the table's row that begins with a name."""
+    return [cell.strip() for cell in re.search(rf"^\| {re.escape(name)} \|(.*)\|$", page, re.MULTILINE)[1].split("|")]
+
+
+BUMPING = {  # rows of the page: the run whose curve it shows, and the evaluation whose contact it counts
+    "SoftGM": ("campaign/wall_touch/softgm/seed0", "evaluations/none"),
+    "SoftGM without stage 1": ("campaign/wall_touch/softgm_no_stage1/seed0", "evaluations/none"),
+}
+
+
+@pytest.mark.parametrize("name", BUMPING)
+def test_what_is_said_of_bumping_is_what_the_committed_curves_and_episodes_hold(name, results):
+    run, evaluation = BUMPING[name]
+    page = results.PAGE.read_text().partition("### A wall that has to be felt")[2].partition("\n### ")[0]
+    curve, contact = (
+        [cell.strip() for cell in row.split("|")[2:-1]] for row in re.findall(rf"^\| {name}(?: \||,).*", page, re.M)
+    )
+    assert curve == reached(ROOT / "experiments" / run)
+    with (ROOT / "experiments" / run / evaluation / "episodes.csv").open() as file:
+        episodes = list(csv.DictReader(file))
+    touched = np.array([int(row["contact_steps"]) if row["success"] == "True" else np.inf for row in episodes])
+    assert contact == [f"{(touched <= steps).mean():.2f}" for steps in (0, 1, 2, 3, 5, 10)]
+
+
+SENSING = {  # rows of the page: folders
+    "SoftGM, seed 0": "campaign/wall_sense/softgm/seed0",
+    "SoftGM, seed 1": "campaign/wall_sense/softgm/seed1",
+    "SoftGM without stage 1, seed 0": "campaign/wall_sense/softgm_no_stage1/seed0",
+    "SoftGM, seed 1, `promote=0.75`": "trials/wall_sense/seed1_promote-0.75",
+}
+
+
+@pytest.mark.parametrize("name", SENSING)
+def test_the_curves_of_the_choice_that_has_to_be_sensed_are_those_of_the_committed_runs(name, results):
+    page = results.PAGE.read_text().partition("### A choice that has to be sensed")[2].partition("\n### ")[0]
+    assert row_of(page, name) == reached(ROOT / "experiments" / SENSING[name])
+
+
+def test_what_is_said_of_the_choice_that_has_to_be_sensed_is_what_the_committed_runs_hold(results):
+    page = " ".join(results.PAGE.read_text().split())
+    folders = [ROOT / "experiments" / folder for folder in list(SENSING.values())[:3]]
+    finals = [json.loads((folder / "summary.json").read_text())["final_evaluation"] for folder in folders]
+    blind = finals[2]
+    told = ["{mean:.3f} [{low:.3f}, {high:.3f}]".format(**one["success_rate"]) for one in finals]
+    assert f"**SoftGM {told[0]} with seed 0 and {told[1]} with seed 1, without stage 1 {told[2]}**" in page
+    failures = round(blind["episodes"] * (1.0 - blind["success_rate"]["mean"]))
+    assert f"({blind['motionless_failures']} of its {failures} failures; none is of contact" in page
+    assert blind["contact_failure"] == 0
+    scenes = [results.episodes_in(folder / "evaluations")["none"]["success"] for folder in folders]
+    split = mcnemar(scenes[0], scenes[2])
+    assert f"the same 500 scenes give {scenes[2].mean():.3f} ({split.lost} lost and {split.won} won against" in page
+    left = certified.of_task("wall_sense").privileged[:, 1] > 0.0
+    sides = [f"{success[side].mean():.3f}" for success in scenes for side in (left, ~left)]
+    assert (
+        "in {2} of those whose open opening is on the arm's left (y > 0) and in {3} of the others".format(*sides)
+        in page
+    )
+    assert "the blind policy in {4} and {5}; seed 0 in {0} and {1}".format(*sides) in page
+    hidden = results.episodes_in(folders[1] / "evaluations")["blind"]["success"].mean()
+    assert f"shown no obstacle it succeeds in {hidden:.3f} of them" in page
+
+
+def test_what_is_said_of_the_curriculum_is_what_the_committed_trainings_hold(results):
+    page = " ".join(results.PAGE.read_text().split())
+    told = []
+    for name in ("SoftGM, seed 1", "SoftGM, seed 0", "SoftGM, seed 1, `promote=0.75`"):
+        with (ROOT / "experiments" / SENSING[name] / "metrics.csv").open() as file:
+            rows = [row for row in csv.DictReader(file) if 480_000 < int(row["frames"]) <= 550_000]
+        episodes = np.array([int(row["episodes"]) for row in rows])
+        success = np.array([float(row["success_rate"]) for row in rows])[episodes > 0]
+        difficulty = np.mean([float(row["difficulty"]) for row in rows])
+        told += [f"{difficulty:.2f}", f"{np.average(success, weights=episodes[episodes > 0]):.2f}"]
+    said = "at a difficulty of {} with {} of its episodes successes, .*; seed 0 at {} with {}\\..* at {}, with {}\\."
+    assert re.search(said.format(*told), page), told
+
+
+KNOWING = {  # rows of the page: the trial whose curve each shows
+    "whole, sensing from 0.15 m": "wall_touch/contact-2_fail-40",
+    "without stage 1": "wall_touch/contact-2_fail-40_no-stage1",
+    "whole, sensing from 0.25 m": "wall_touch/contact-2_fail-40_sense-0.25",
+    "without stage 1, rewarded for what is discovered from 0.25 m": "wall_touch/contact-2_fail-40_sense-0.25_no-stage1",
+    "without stage 1, told where the opening is": "wall_touch/contact-2_fail-40_sense-0.25_oracle",
+    "without stage 1, told which": "wall_decoy/closed_contact-5_sense-0.25_oracle",
+    "without stage 1, not told": "wall_decoy/closed_contact-5_sense-0.25_blind",
+}
+
+
+@pytest.mark.parametrize("name", KNOWING)
+def test_what_is_said_of_knowing_is_what_the_trials_hold(name, results):
+    folder = ROOT / "experiments/trials" / KNOWING[name]
+    page = results.PAGE.read_text().partition("### To know is not yet to pass")[2].partition("\n##")[0]
+    lines = [json.loads(line) for line in (folder / "evaluations.jsonl").read_text().splitlines()]
+    assert [cell for cell in row_of(page, name) if cell] == [f"{line['success_rate']['mean']:.2f}" for line in lines]
+    if (folder / "evaluations").exists():
+        scenes = [results.episodes_in(folder / "evaluations")[shown]["success"] for shown in ("none", "swap_opening")]
+        split = mcnemar(*scenes)
+        own, others = (f"{scene.mean():.3f}" for scene in scenes)
+        told = f"{others} instead of {own} of 256 scenes ({split.lost} lost, {split.won} won"
+        assert told in " ".join(page.split())
