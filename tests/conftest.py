@@ -1,5 +1,6 @@
 """Shared fixtures: two cores at most, and task settings as the command line composes them."""
 
+import gc
 import os
 import signal
 import threading
@@ -20,6 +21,14 @@ compilation.told()
 # whoever started the tests in the background has them ignore Ctrl-C, and so would every command that they start
 if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# To compose settings, which most tests do, makes objects by the ten thousand, in a process that has half a million.
+gc.set_threshold(10_000)
+
+
+def pytest_collection_finish():
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")

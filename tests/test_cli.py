@@ -41,17 +41,25 @@ MISTAKES = {
         ["task=wal"],
         "task=wal: no such task; choose one of basic, structured, swinging_posts, ",
     ),
-    "misspelt key": (["experiment.num_env=4"], "experiment.num_env: no such key; did you mean experiment.num_envs?"),
     "wrong type": (["experiment.num_envs=many"], "experiment.num_envs: Value 'many' of type 'str' could not be"),
     "negative seed": (["seed=-1"], "seed=-1: a seed is a whole number from 0"),
-    "zero environments": (["experiment.num_envs=0"], "experiment.num_envs=0: it must be at least 1"),
     "unwritable folder": (["run_dir=file/run"], "run_dir=file/run: Not a directory; choose a folder that can be"),
-    "no override": (["wall"], "settings are written key=value"),
     "dashes": (["--seed=3"], "--seed=3: no such option; settings are written without dashes: seed=value"),
+}
+MORE_MISTAKES = {
+    "misspelt key": (["experiment.num_env=4"], "experiment.num_env: no such key; did you mean experiment.num_envs?"),
+    "zero environments": (["experiment.num_envs=0"], "experiment.num_envs=0: it must be at least 1"),
+    "no override": (["wall"], "settings are written key=value"),
 }
 
 
-@pytest.mark.parametrize(("arguments", "says"), MISTAKES.values(), ids=MISTAKES)
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        *(pytest.param(*case, id=name) for name, case in MISTAKES.items()),
+        *(pytest.param(*case, id=name, marks=pytest.mark.slow) for name, case in MORE_MISTAKES.items()),
+    ],
+)
 def test_a_mistake_is_answered_by_one_line_and_leaves_nothing_behind(tmp_path, arguments, says):
     (tmp_path / "file").write_text("")
 
@@ -99,7 +107,13 @@ def test_a_sweep_runs_every_job_and_reports_each_that_fails(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129), (signal.SIGUSR1, 138)]
+    ("number", "code"),
+    [
+        (signal.SIGINT, 130),
+        (signal.SIGTERM, 143),
+        pytest.param(signal.SIGHUP, 129, marks=pytest.mark.slow),
+        pytest.param(signal.SIGUSR1, 138, marks=pytest.mark.slow),
+    ],
 )
 def test_an_interrupted_run_says_where_its_checkpoint_is(tmp_path, number, code):
     from softgm_bench.runs import checkpoint
@@ -125,6 +139,7 @@ def test_an_interrupted_run_says_where_its_checkpoint_is(tmp_path, number, code)
     assert state["frames"] == 8 * state["counters"]["iteration"] == 8 * (metrics.read_text().count("\n") - 1)
 
 
+@pytest.mark.slow
 def test_a_run_that_nobody_reads_comes_to_its_end(tmp_path):
     command_line = " ".join(f"'{word}'" for word in command(*TINY))
     result = subprocess.run(["bash", "-c", f"{command_line} 2>&1 >/dev/full | head -c 1"], cwd=tmp_path, check=False)

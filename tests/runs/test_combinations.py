@@ -18,7 +18,8 @@ from softgm_bench.runs import checkpoint
 from softgm_bench.runs.loop import train
 from softgm_bench.storage.run_folder import RunFolder
 
-TASKS = tuple(task for task in every_task.TASKS if task not in every_task.FELT)
+WALLS = ("wall_narrow", "wall_fixed", *every_task.FELT)  # which differ from `wall` in numbers
+TASKS = tuple(task for task in every_task.TASKS if task not in WALLS)
 ALGORITHMS = tuple(algorithm_configs())
 ON_POLICY = ("softgm", "ippo", "mappo")
 ABLATIONS = ("softgm_no_stage1", "softgm_no_stage2", "softgm_remember")  # models of SoftGM's algorithm
@@ -80,8 +81,8 @@ def test_every_algorithm_trains_with_every_model_on_every_task(tmp_path, algo, m
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("algo", "task"), product(("softgm", "ippo", "masac", "iddpg"), every_task.FELT))
-def test_algorithms_of_every_kind_train_on_walls_that_have_to_be_felt(tmp_path, algo, task):
+@pytest.mark.parametrize(("algo", "task"), product(("softgm", "ippo", "masac", "iddpg"), WALLS))
+def test_algorithms_of_every_kind_train_on_the_other_walls(tmp_path, algo, task):
     assert check_run(tmp_path, algo, f"task={task}", f"model={OWN[algo]}")["task"] == task
 
 

@@ -7,7 +7,9 @@ it against the dataclasses, so a misspelt key or a wrong type is refused whereve
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from copy import deepcopy
 from dataclasses import asdict, fields, is_dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, get_origin, get_type_hints
 
@@ -173,13 +175,22 @@ def _perturbation_schema() -> DictConfig:
 
 
 def _schema(cls: type) -> DictConfig:
-    """Structured config of a dataclass; OmegaConf would keep a frozen one read-only, even while merging."""
+    """Structured config of a dataclass, for the caller to change."""
+    return deepcopy(_made_schema(cls))
+
+
+@cache
+def _made_schema(cls: type) -> DictConfig:
+    """Made once, for it takes as long as all else that ``typed`` does.
+
+    OmegaConf would keep a frozen dataclass read-only, even while merging.
+    """
     node = OmegaConf.structured(cls)
     OmegaConf.set_readonly(node, False)
     hints = get_type_hints(cls)
     for item in fields(cls):
         if is_dataclass(hints[item.name]):
-            node[item.name] = _schema(hints[item.name])
+            node[item.name] = _made_schema(hints[item.name])
     return node
 
 
