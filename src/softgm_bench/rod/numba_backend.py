@@ -170,7 +170,7 @@ def _make_step(n_elements: int, dtype: type, contact_model: str, moving: bool, d
                 memory = np.empty(layout.size + width, rows.dtype)
                 skip = (-memory.ctypes.data % CACHE_LINE) // itemsize
                 s = memory[skip : skip + layout.size]
-                s[:] = rows
+                fill(s, rows)
                 load(s, position[b], director[b], velocity[b], omega[b], couple[b], force[b])
                 advance(s, cylinders[b], scalars, contact, substeps)
                 if single:
@@ -185,7 +185,7 @@ def _make_step(n_elements: int, dtype: type, contact_model: str, moving: bool, d
                 memory = np.empty(layout.size + width, rows.dtype)
                 skip = (-memory.ctypes.data % CACHE_LINE) // itemsize
                 s = memory[skip : skip + layout.size]
-                s[:] = rows
+                fill(s, rows)
                 shape(s, scales[b])
                 load(s, position[b], director[b], velocity[b], omega[b], couple[b], force[b])
                 advance(s, cylinders[b], scalars[b], contact[b], substeps)
@@ -197,6 +197,7 @@ def _make_step(n_elements: int, dtype: type, contact_model: str, moving: bool, d
     return jit(
         control_step_of_bodies if drawn else control_step,
         parallel=True,
+        fill=_make_fill(layout),
         load=_make_load(layout),
         store=_make_store(layout),
         advance=_make_advance(layout, dtype, contact_model, moving),
@@ -247,6 +248,18 @@ def _make_advance(layout: Layout, real: type, contact_model: str, moving: bool) 
     return jit(advance, **callees, speed=motion.speed, carry=motion.carry)
 
 
+# Arrays are copied element by element: a slice that is assigned to has Numba compile the message of the error that it
+# raises where shapes differ, which takes seconds in every process that compiles.
+def _make_fill(layout: Layout) -> Callable[..., Any]:
+    size = layout.size
+
+    def fill(s, rows):
+        for k in range(size):
+            s[k] = rows[k]
+
+    return jit(fill)
+
+
 def _make_load(layout: Layout) -> Callable[..., Any]:
     p, n = layout, layout.n
 
@@ -254,10 +267,11 @@ def _make_load(layout: Layout) -> Callable[..., Any]:
         for i, (x, v, g, f) in enumerate(
             ((p.px, p.vx, p.gx, p.fx), (p.py, p.vy, p.gy, p.fy), (p.pz, p.vz, p.gz, p.fz))
         ):
-            s[x : x + n + 1] = position[i]
-            s[v : v + n + 1] = velocity[i]
-            s[g : g + n + 1] = force[i]
-            s[f : f + n + 1] = force[i]
+            for k in range(n + 1):
+                s[x + k] = position[i, k]
+                s[v + k] = velocity[i, k]
+                s[g + k] = force[i, k]
+                s[f + k] = force[i, k]
         for i, (q0, q1, q2, w, t) in enumerate(
             (
                 (p.q00, p.q01, p.q02, p.w0, p.t0),
@@ -265,11 +279,12 @@ def _make_load(layout: Layout) -> Callable[..., Any]:
                 (p.q20, p.q21, p.q22, p.w2, p.t2),
             )
         ):
-            s[q0 : q0 + n] = director[i, 0]
-            s[q1 : q1 + n] = director[i, 1]
-            s[q2 : q2 + n] = director[i, 2]
-            s[w : w + n] = omega[i]
-            s[t : t + n] = couple[i]
+            for k in range(n):
+                s[q0 + k] = director[i, 0, k]
+                s[q1 + k] = director[i, 1, k]
+                s[q2 + k] = director[i, 2, k]
+                s[w + k] = omega[i, k]
+                s[t + k] = couple[i, k]
 
     return jit(load)
 
@@ -279,14 +294,16 @@ def _make_store(layout: Layout) -> Callable[..., Any]:
 
     def store(s, position, director, velocity, omega):
         for i, (x, v) in enumerate(((p.px, p.vx), (p.py, p.vy), (p.pz, p.vz))):
-            position[i] = s[x : x + n + 1]
-            velocity[i] = s[v : v + n + 1]
+            for k in range(n + 1):
+                position[i, k] = s[x + k]
+                velocity[i, k] = s[v + k]
         for i, (q0, q1, q2, w) in enumerate(
             ((p.q00, p.q01, p.q02, p.w0), (p.q10, p.q11, p.q12, p.w1), (p.q20, p.q21, p.q22, p.w2))
         ):
-            director[i, 0] = s[q0 : q0 + n]
-            director[i, 1] = s[q1 : q1 + n]
-            director[i, 2] = s[q2 : q2 + n]
-            omega[i] = s[w : w + n]
+            for k in range(n):
+                director[i, 0, k] = s[q0 + k]
+                director[i, 1, k] = s[q1 + k]
+                director[i, 2, k] = s[q2 + k]
+                omega[i, k] = s[w + k]
 
     return jit(store)
