@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from softgm_bench.analysis.runs import Run, find
+from softgm_bench.config.schema import model_name
 from softgm_bench.episodes import policy
 from softgm_bench.episodes.policy import TrainedPolicy
 
@@ -55,12 +56,23 @@ def cards() -> Iterator[Card]:
         trained = policy.load(file)
         cell = Path(trained.run.task.name, trained.label, f"seed{trained.run.seed}")
         for folder in (Path(runs) / cell for runs in RUNS):
-            found = find(ROOT / "experiments" / folder).runs if (ROOT / "experiments" / folder).exists() else []
-            if found and found[0].final.frames == trained.frames:
-                yield Card(file, trained, folder, found[0])
+            run = run_of(trained, ROOT / "experiments" / folder)
+            if run is not None:
+                yield Card(file, trained, folder, run)
                 break
         else:
             raise SystemExit(f"{file.name}: no run of {cell} in {' or '.join(RUNS)} has {trained.frames} frames")
+
+
+def run_of(trained: TrainedPolicy, folder: Path) -> Run | None:
+    """Give the run that a folder holds, if it is the policy's: as long, and with no other policy kept in it."""
+    found = find(folder).runs if folder.exists() else []
+    kept = folder / "policy.pt"
+    if not found or found[0].final.frames != trained.frames:
+        return None
+    if kept.exists() and policy.fingerprint(policy.load(kept)) != policy.fingerprint(trained):
+        return None
+    return found[0]
 
 
 def written(card: Card) -> str:
@@ -86,7 +98,12 @@ def command(card: Card) -> str:
     """Give the command that trained a policy of the campaign, which asks for nothing but its cell and its machine."""
     run = card.trained.run
     memory = getattr(run.algo.actor, "memory", None)
-    words = {"algo": run.algo.name, "model": run.model.name, "observation": run.observation, "task": run.task.name}
+    words = {
+        "algo": run.algo.name,
+        "model": model_name(run.model),
+        "observation": run.observation,
+        "task": run.task.name,
+    }
     words |= {} if memory is None else {"algo.actor.memory": f"{{cell:{memory.cell},size:{memory.size}}}"}
     words |= {"seed": run.seed, "threads": run.threads, "matmul": run.matmul}
     return f"python -m softgm_bench {shlex.join(f'{key}={value}' for key, value in words.items())}"

@@ -32,7 +32,7 @@ MLPS = {
     "and 512 environments, minibatches of 1280": "trials/wall/mappo_envs-512",
     "and embeddings not normalised": "trials/wall/mappo_no-embedding-norm",
     "and episodes of 200 steps": "trials/wall/mappo_train-horizon-200",
-    "the published run's recipe: an MLP's now": "trials/wall/mappo_large-steps",
+    "the published run's recipe: an MLP's now": "campaign/wall/mappo/seed0",
     "the published run": "trained/wall/mappo/seed0",
 }
 TABLES = {"what learns on wall": SMALL_STEPS, "mlps on the wall": MLPS}

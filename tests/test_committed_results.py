@@ -169,6 +169,7 @@ def test_no_kept_policy_names_a_folder_of_the_machine_that_trained_it():
     [
         ("trials/wall/envs-128_promote-0.5_entropy-0.003/policy-2400000", 2_400_000, "gamma 0.95"),
         ("campaign/wall/softgm/seed0/evaluations", 3_001_600, "gamma 0.98"),
+        ("campaign/wall/mappo/seed0/evaluations", 3_008_000, "MAPPO on `wall`"),
         ("campaign/wall_touch/softgm/seed0/evaluations", 3_001_600, "`wall_touch`"),
         ("campaign/wall_sense/softgm/seed0/evaluations", 3_001_600, "`wall_sense`"),
     ],

@@ -52,6 +52,7 @@ SENSING = {  # rows of the page: folders
     "SoftGM, seed 0": "campaign/wall_sense/softgm/seed0",
     "SoftGM, seed 1": "campaign/wall_sense/softgm/seed1",
     "SoftGM without stage 1, seed 0": "campaign/wall_sense/softgm_no_stage1/seed0",
+    "SoftGM, seed 0, `promote=0.75`": "trials/wall_sense/seed0_promote-0.75",
     "SoftGM, seed 1, `promote=0.75`": "trials/wall_sense/seed1_promote-0.75",
 }
 
@@ -84,6 +85,21 @@ def test_what_is_said_of_the_choice_that_has_to_be_sensed_is_what_the_committed_
     assert "the blind policy in {4} and {5}; seed 0 in {0} and {1}".format(*sides) in page
     hidden = results.episodes_in(folders[1] / "evaluations")["blind"]["success"].mean()
     assert f"shown no obstacle it succeeds in {hidden:.3f} of them" in page
+
+
+def test_what_is_said_of_the_trial_that_chooses_is_what_it_holds(results):
+    page = " ".join(results.PAGE.read_text().split())
+    folder = ROOT / "experiments" / SENSING["SoftGM, seed 1, `promote=0.75`"]
+    final = json.loads((folder / "summary.json").read_text())["final_evaluation"]
+    assert "{mean:.3f} [{low:.3f}, {high:.3f}] of 1000 scenes at the end".format(**final["success_rate"]) in page
+    played = {shown: episodes["success"] for shown, episodes in results.episodes_in(folder / "evaluations").items()}
+    left = certified.of_task("wall_sense").privileged[:, 1] > 0.0
+    sides = [f"{played['none'][side].mean():.3f}" for side in (left, ~left)]
+    shown = [f"{played[shown].mean():.3f}" for shown in ("blind", "swap_obstacles")]
+    told = (
+        "in the 500 scenes {} with the open opening on the left and {} with it on the right, {} when shown no obstacle "
+    )
+    assert (told + "and {} when shown another scene's").format(*sides, *shown) in page
 
 
 def test_what_is_said_of_the_curriculum_is_what_the_committed_trainings_hold(results):
