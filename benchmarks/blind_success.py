@@ -1,6 +1,6 @@
 """How far an arm gets on a wall that feels nothing: the best blind success, by geometry alone.
 
-``python benchmarks/blind_success.py`` prints two tables and writes the figures.
+``python benchmarks/blind_success.py`` prints three tables and writes the figures.
 
 The ideal blind arm knows the task's distribution and the target, and moves where it wants. A try is a crossing of the
 wall's plane at a point; it passes if the columns beside the opening, and the round ends of those that are cut, are at
@@ -11,6 +11,9 @@ know the plane: a bound from above. At a dead end a try is lost.
 The second table says how much of the opening the target tells: the coefficient of determination of its place along the
 wall and of its height on held-out scenes, by a linear fit and by the mean of the nearest 50 of the scenes. ``wall``
 redraws target and opening together until the way through is short enough; the others draw them independently.
+
+The third says the same of the scenes of a curriculum, where one of two openings is closed: the share in which the side
+that most of the nearest 50 scenes have is right. In the easiest of them targets lie straight behind the open one.
 """
 
 import argparse
@@ -26,6 +29,8 @@ from softgm_bench.envs.tasks import make_task
 from softgm_bench.envs.tasks.wall import Wall
 
 TASKS = ("wall", "wall_touch", "wall_search", "wall_decoy", "wall_sense")
+TWO_OPENINGS = ("wall_decoy", "wall_sense")
+DIFFICULTIES = (0.0, 0.5, 0.7, 0.8, 0.85, 0.9, 0.95, 1.0)
 TRIES = (1, 2, 6)
 CLEARANCE = 0.05  # m, the arm's radius
 STEP = 0.01  # m, between two candidates
@@ -89,15 +94,20 @@ def blind(name: str, targets: int, count: int) -> dict[str, Any]:
     return {"task": name} | {f"tries_{tries}": round(float(mean[tries - 1]), 3) for tries in TRIES}
 
 
+def nearest(target: Tensor) -> Tensor:
+    """For each scene of the second half those of the first half with the nearest targets, ``(n, NEIGHBOURS)``."""
+    n = len(target) // 2
+    scaled = (target - target[:n].mean(dim=0)) / target[:n].std(dim=0)
+    return torch.cdist(scaled[n:], scaled[:n]).topk(NEIGHBOURS, dim=1, largest=False).indices
+
+
 def explained(opening: Tensor, target: Tensor) -> dict[str, float]:
     """Coefficients of determination on the second half of the scenes, fitted to the first half."""
     n = len(opening) // 2
     design = torch.cat([torch.ones(len(target), 1, dtype=target.dtype), target], dim=-1)
     linear = design[n:] @ torch.linalg.lstsq(design[:n], opening[:n]).solution
-    scaled = (target - target[:n].mean(dim=0)) / target[:n].std(dim=0)
-    nearest = torch.cdist(scaled[n:], scaled[:n]).topk(NEIGHBOURS, dim=1, largest=False).indices
     found = {}
-    for kind, guess in (("linear", linear), ("nearest", opening[:n][nearest].mean(dim=1))):
+    for kind, guess in (("linear", linear), ("nearest", opening[:n][nearest(target)].mean(dim=1))):
         rest = (opening[n:] - guess).square().mean(dim=0) / opening[n:].var(dim=0)
         found |= {f"{kind}_{axis}": round(1.0 - float(rest[i]), 3) for i, axis in enumerate(("along", "height"))}
     return found
@@ -106,6 +116,22 @@ def explained(opening: Tensor, target: Tensor) -> dict[str, float]:
 def told(name: str, count: int) -> dict[str, Any]:
     task = make_task(compose([f"task={name}", "recipe=paper"]).task)
     return {"task": name} | explained(*openings(task, count, 0))
+
+
+def side_told(left: Tensor, target: Tensor) -> float:
+    """Share of the second half of the scenes whose open side is that of most of the nearest in the first half."""
+    n = len(left) // 2
+    guess = left[:n][nearest(target)].double().mean(dim=1) > 0.5
+    return float((guess == left[n:]).double().mean())
+
+
+def by_difficulty(name: str, count: int) -> dict[str, Any]:
+    task = make_task(compose([f"task={name}", "recipe=tuned"]).task)  # the recipe that has a curriculum
+    row: dict[str, Any] = {"task": name}
+    for difficulty in DIFFICULTIES:
+        scene = task.sample(count, torch.Generator().manual_seed(0), torch.tensor(difficulty, dtype=torch.float64))
+        row[f"{difficulty:g}"] = round(side_told(scene.privileged[:, 1] > 0.0, scene.target), 3)
+    return row
 
 
 def main() -> None:
@@ -118,11 +144,12 @@ def main() -> None:
     torch.set_num_threads(1)
     rows = [blind(name, arguments.targets, arguments.openings) for name in TASKS]
     explains = [told(name, arguments.scenes) for name in TASKS]
-    for table in (rows, explains):
+    sides = [by_difficulty(name, arguments.scenes) for name in TWO_OPENINGS]
+    for table in (rows, explains, sides):
         print(" | ".join(table[0]))
         print("\n".join(" | ".join(str(value) for value in row.values()) for row in table))
     settings = {name: getattr(arguments, name) for name in ("targets", "openings", "scenes")}
-    write(arguments.output, {"clearance": CLEARANCE} | settings | {"blind": rows, "told": explains})
+    write(arguments.output, {"clearance": CLEARANCE} | settings | {"blind": rows, "told": explains, "sides": sides})
 
 
 if __name__ == "__main__":

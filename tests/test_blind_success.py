@@ -59,6 +59,18 @@ def test_the_page_has_the_figures():
         assert "| " + " | ".join([f"`{row['task']}`", *shares, *explained]) + " |" in PAGE
 
 
+def test_a_side_that_the_target_tells_is_told_and_one_that_it_does_not_is_guessed():
+    target = torch.rand((4000, 3), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    assert blind_success.side_told(target[:, 1] > 0.5, target) > 0.97
+    assert 0.45 < blind_success.side_told(torch.arange(4000) % 2 == 0, target) < 0.55
+
+
+def test_the_page_says_at_which_difficulty_targets_tell_the_open_side():
+    for row in FIGURES["sides"]:
+        shares = [f"{row[f'{difficulty:g}']:.2f}" for difficulty in blind_success.DIFFICULTIES]
+        assert "| " + " | ".join([f"`{row['task']}`", *shares]) + " |" in PAGE
+
+
 @pytest.mark.parametrize("name", ["wall", *FELT])
 def test_the_page_has_the_number_of_certified_scenes(name):
     known = certified.of_task(name)
