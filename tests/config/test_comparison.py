@@ -50,5 +50,6 @@ def test_what_came_later_is_free_unless_it_changes_numbers():
     networks = {f"algo.{part}.{norm}_norm" for part in ("actor", "critic") for norm in ("embedding", "hidden")}
     networks |= {"algo.actor.relative_points", "algo.actor.memory", "model.remember", "matmul"}
     surfaces = {f"task.{name}_coefficient" for name in ("friction", "velocity_damping")}
-    tasks = surfaces | {"task.max_contact_steps", "task.reward.lambda_fail", "task.curriculum.easy_target_offset"}
+    tasks = surfaces | {"task.max_contact_steps", "task.reward.lambda_fail"}
+    tasks |= {f"task.curriculum.{name}" for name in ("easy_target_offset", "target_power")}
     assert set(NEUTRAL) - set(FREE) == networks | tasks

@@ -267,6 +267,22 @@ def test_the_easiest_targets_keep_the_share_of_their_offset_that_is_asked_for(se
         assert whole[:, axis].std() > 0.2 * (high - low)
 
 
+@pytest.mark.parametrize("name", ["wall", "wall_sense"])
+def test_a_power_takes_targets_to_their_own_place_early_and_leaves_the_rest_of_the_scene_where_it_was(settings, name):
+    def drawn(power, value):
+        config = settings(f"task={name}", ENABLED, f"task.curriculum.target_power={power}").task
+        return make_task(config).sample(40, torch.Generator().manual_seed(5), level(value))
+
+    linear, cubic = (drawn(power, 0.5) for power in (1.0, 3.0))
+    same = (cubic.privileged == linear.privileged).all(dim=-1)  # not drawn again for too long a way in either
+    assert same.sum() > 20
+    assert torch.equal(cubic.target[same, 0], linear.target[same, 0])
+    offset, kept = ((scene.target - scene.privileged[:, :3])[same, 1:] for scene in (linear, cubic))
+    assert torch.allclose(kept, (0.875 / 0.5) * offset)
+    for value in (0.0, 1.0):
+        assert torch.equal(drawn(3.0, value).target, drawn(1.0, value).target)
+
+
 @given(value=st.floats(0.0, 1.0), seed=st.integers(0, 2**32 - 1))
 @hypothesis_settings(max_examples=30, deadline=None)
 def test_targets_of_the_other_tasks_fill_ranges_between_the_easiest_and_their_own(settings, value, seed):
@@ -305,6 +321,7 @@ def test_targets_of_the_other_tasks_fill_ranges_between_the_easiest_and_their_ow
         ("task.curriculum.demote=-0.1", r"task.curriculum.demote is -0.1"),
         ("task.curriculum.easy_opening_side=0.2", r"task.curriculum.easy_opening_side is 0.2"),
         ("task.curriculum.easy_target_offset=1.5", r"task.curriculum.easy_target_offset is 1.5: it must lie between"),
+        ("task.curriculum.target_power=0.0", r"task.curriculum.target_power is 0.0: it must be above 0"),
         ("task.curriculum.easy_opening_side=1.2", r"with task.curriculum.easy_opening_side 1.2"),
     ],
 )

@@ -29,6 +29,7 @@ class WallCurriculumConfig(CurriculumConfig):
     easy_opening_side: float
     easy_target_x: Range
     easy_target_offset: float
+    target_power: float
 
     def __post_init__(self) -> None:
         """Refuse values by which nothing could be decided or drawn.
@@ -41,10 +42,14 @@ class WallCurriculumConfig(CurriculumConfig):
             raise ValueError(
                 f"task.curriculum.easy_target_offset is {self.easy_target_offset}: it must lie between 0 and 1"
             )
+        if not self.target_power > 0.0:
+            raise ValueError(f"task.curriculum.target_power is {self.target_power}: it must be above 0")
 
     def kept_offset(self, difficulty: Tensor) -> Tensor:
         """The share of its distance in y and z from the opening's centre that a target keeps; exactly 1 at the end."""
-        return difficulty + self.easy_target_offset * (1.0 - difficulty)
+        # 1 keeps the digits that were there before there was a power
+        own = difficulty if self.target_power == 1.0 else 1.0 - (1.0 - difficulty) ** self.target_power
+        return own + self.easy_target_offset * (1.0 - own)
 
 
 @dataclass
