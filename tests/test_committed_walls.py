@@ -53,6 +53,7 @@ SENSING = {  # rows of the page: folders
     "SoftGM, seed 1": "campaign/wall_sense/softgm/seed1",
     "SoftGM without stage 1, seed 0": "campaign/wall_sense/softgm_no_stage1/seed0",
     "SoftGM, seed 0, `promote=0.75`": "trials/wall_sense/seed0_promote-0.75",
+    "SoftGM, seed 0, `promote=0.75`, `demote=0.5`": "trials/wall_sense/seed0_promote-0.75_demote-0.5",
     "SoftGM, seed 1, `promote=0.75`": "trials/wall_sense/seed1_promote-0.75",
 }
 
