@@ -19,8 +19,8 @@ def cover(rows):
     return chosen
 
 
-def pairwise(*factors):
-    """Parameters for the product of the factors; those outside of the cover are slow."""
+def pairwise(*factors, slow=()):
+    """Parameters for the product of the factors; those outside of the cover or with a ``slow`` value are slow."""
     rows = list(product(*factors))
-    quick = cover(rows)
+    quick = cover([row for row in rows if not set(row) & set(slow)])
     return [pytest.param(*row, marks=() if row in quick else pytest.mark.slow) for row in rows]

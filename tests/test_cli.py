@@ -41,24 +41,20 @@ MISTAKES = {
         ["task=wal"],
         "task=wal: no such task; choose one of basic, structured, swinging_posts, ",
     ),
+    "misspelt key": (["experiment.num_env=4"], "experiment.num_env: no such key; did you mean experiment.num_envs?"),
     "wrong type": (["experiment.num_envs=many"], "experiment.num_envs: Value 'many' of type 'str' could not be"),
     "negative seed": (["seed=-1"], "seed=-1: a seed is a whole number from 0"),
+    "zero environments": (["experiment.num_envs=0"], "experiment.num_envs=0: it must be at least 1"),
     "unwritable folder": (["run_dir=file/run"], "run_dir=file/run: Not a directory; choose a folder that can be"),
+    "no override": (["wall"], "settings are written key=value"),
     "dashes": (["--seed=3"], "--seed=3: no such option; settings are written without dashes: seed=value"),
 }
-MORE_MISTAKES = {
-    "misspelt key": (["experiment.num_env=4"], "experiment.num_env: no such key; did you mean experiment.num_envs?"),
-    "zero environments": (["experiment.num_envs=0"], "experiment.num_envs=0: it must be at least 1"),
-    "no override": (["wall"], "settings are written key=value"),
-}
+SLOW = ("misspelt key", "zero environments", "no override")  # they take the way out of another
 
 
 @pytest.mark.parametrize(
     ("arguments", "says"),
-    [
-        *(pytest.param(*case, id=name) for name, case in MISTAKES.items()),
-        *(pytest.param(*case, id=name, marks=pytest.mark.slow) for name, case in MORE_MISTAKES.items()),
-    ],
+    [pytest.param(*MISTAKES[name], id=name, marks=[pytest.mark.slow] * (name in SLOW)) for name in MISTAKES],
 )
 def test_a_mistake_is_answered_by_one_line_and_leaves_nothing_behind(tmp_path, arguments, says):
     (tmp_path / "file").write_text("")

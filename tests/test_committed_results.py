@@ -205,6 +205,21 @@ def test_the_published_policies_that_a_kept_trial_is_compared_with_played_the_sa
         )
 
 
+def test_what_interventions_cost_mappo_on_the_wall_is_what_its_cell_holds(results):
+    page = results.PAGE.read_text()
+    played = results.episodes_in(ROOT / "experiments/campaign/wall/mappo/seed0/evaluations")
+    rows = {
+        "what agents have sensed": (results.episodes_in(results.TRIAL)["none"], "none"),
+        "no obstacle": (played["none"], "blind"),
+        "another scene's obstacles": (played["none"], "swap_obstacles"),
+        "only what is sensed now": (played["none"], "sensed_only"),
+    }
+    for shown, (usual, intervention) in rows.items():
+        split = mcnemar(usual["success"], played[intervention]["success"])
+        row = rf"^\| MAPPO on `wall`, {shown} \| {played[intervention]['success'].mean():.3f} \|"
+        assert re.search(rf"{row}.*\| {split.lost}, {split.won} \| [^|]* \|$", page, re.MULTILINE), shown
+
+
 def test_what_the_walls_recipe_reached_is_its_runs_own_final_evaluation(results):
     folder = ROOT / "experiments/campaign/wall/softgm/seed0"
     final = json.loads((folder / "summary.json").read_text())["final_evaluation"]

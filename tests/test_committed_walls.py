@@ -28,6 +28,12 @@ def row_of(page, name):
     return [cell.strip() for cell in re.search(rf"^\| {re.escape(name)} \|(.*)\|$", page, re.MULTILINE)[1].split("|")]
 
 
+def by_side(success):
+    """Success in the certified scenes of `wall_sense` whose open opening is on the arm's left, and in the others."""
+    left = certified.of_task("wall_sense").privileged[:, 1] > 0.0
+    return [f"{success[side].mean():.3f}" for side in (left, ~left)]
+
+
 BUMPING = {  # rows of the page: the run whose curve it shows, and the evaluation whose contact it counts
     "SoftGM": ("campaign/wall_touch/softgm/seed0", "evaluations/none"),
     "SoftGM without stage 1": ("campaign/wall_touch/softgm_no_stage1/seed0", "evaluations/none"),
@@ -77,8 +83,7 @@ def test_what_is_said_of_the_choice_that_has_to_be_sensed_is_what_the_committed_
     scenes = [results.episodes_in(folder / "evaluations")["none"]["success"] for folder in folders]
     split = mcnemar(scenes[0], scenes[2])
     assert f"the same 500 scenes give {scenes[2].mean():.3f} ({split.lost} lost and {split.won} won against" in page
-    left = certified.of_task("wall_sense").privileged[:, 1] > 0.0
-    sides = [f"{success[side].mean():.3f}" for success in scenes for side in (left, ~left)]
+    sides = [share for success in scenes for share in by_side(success)]
     assert (
         "in {2} of those whose open opening is on the arm's left (y > 0) and in {3} of the others".format(*sides)
         in page
@@ -94,13 +99,19 @@ def test_what_is_said_of_the_trial_that_chooses_is_what_it_holds(results):
     final = json.loads((folder / "summary.json").read_text())["final_evaluation"]
     assert "{mean:.3f} [{low:.3f}, {high:.3f}] of 1000 scenes at the end".format(**final["success_rate"]) in page
     played = {shown: episodes["success"] for shown, episodes in results.episodes_in(folder / "evaluations").items()}
-    left = certified.of_task("wall_sense").privileged[:, 1] > 0.0
-    sides = [f"{played['none'][side].mean():.3f}" for side in (left, ~left)]
     shown = [f"{played[shown].mean():.3f}" for shown in ("blind", "swap_obstacles")]
     told = (
         "in the 500 scenes {} with the open opening on the left and {} with it on the right, {} when shown no obstacle "
     )
-    assert (told + "and {} when shown another scene's").format(*sides, *shown) in page
+    assert (told + "and {} when shown another scene's").format(*by_side(played["none"]), *shown) in page
+
+
+def test_what_is_said_of_a_curriculum_that_goes_back_is_what_its_trial_holds(results):
+    folder = ROOT / "experiments" / SENSING["SoftGM, seed 0, `promote=0.75`, `demote=0.5`"]
+    curve = script(ROOT / "experiments" / "trials.py").curve(folder)
+    told = ", ".join(f"{curve[number]:.2f}" for number in (5, 6, 7))
+    page = " ".join(results.PAGE.read_text().split())
+    assert f"{told} of 256 scenes after 1.25, 1.5, 1.75 million frames" in page
 
 
 def test_what_is_said_of_the_curriculum_is_what_the_committed_trainings_hold(results):

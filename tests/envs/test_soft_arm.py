@@ -49,9 +49,12 @@ def edit(env, change):
 @pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize(
     "options",
-    # of 20 elements: other tests have that kernel compiled already
-    [{}, {"dtype": torch.float32, "rod": RodParameters(n_elements=20)}],
-    ids=["float64", "float32"],
+    [
+        pytest.param({}, id="float64"),
+        # other tests have this kernel compiled already
+        pytest.param({"dtype": torch.float32, "rod": RodParameters(n_elements=20)}, id="float32, 20 elements"),
+        pytest.param({"dtype": torch.float32}, id="float32", marks=pytest.mark.slow),
+    ],
 )
 def test_specs_are_kept(build, task, options):
     check_env_specs(build(task, **options))
@@ -65,7 +68,7 @@ def test_the_torch_backend_makes_the_same_episodes(build):
 
 
 @pytest.mark.parametrize("n_agents", [1, 2, 4, 9])
-@pytest.mark.parametrize("n_elements", [20, 60])
+@pytest.mark.parametrize("n_elements", [pytest.param(11, marks=pytest.mark.slow), 20, 60])
 def test_agents_and_elements_are_parameters(build, n_agents, n_elements):
     rod = RodParameters(n_elements=n_elements, substeps=5)
     env = build("structured", overrides=(f"task.n_agents={n_agents}", "task.slots=5"), rod=rod)
