@@ -18,7 +18,7 @@ from softgm_bench.envs.tasks.base import CurriculumConfig, eased
 from softgm_bench.errors import UserError
 
 ENABLED = "task.curriculum.enabled=true"
-FOUR = CurriculumConfig(enabled=True, stages=2, episodes=4, promote=0.6, demote=0.2)
+FOUR = CurriculumConfig(enabled=True, stages=2, episodes=4, promote=0.6, demote=0.2, easier_share=0.0)
 
 
 def level(value):
@@ -126,7 +126,7 @@ def test_decisions_need_no_values_and_stay_on_their_device():
 )
 @hypothesis_settings(max_examples=60, deadline=None)
 def test_any_course_of_events_is_decided_as_plain_counting_does(num_envs, episodes, stages, steps):
-    config = CurriculumConfig(enabled=True, stages=stages, episodes=episodes, promote=0.6, demote=0.2)
+    config = CurriculumConfig(enabled=True, stages=stages, episodes=episodes, promote=0.6, demote=0.2, easier_share=0.0)
     progress = first_progress(num_envs, torch.device("cpu"))
     progress.counting.fill_(True)
     stage, counting, results = 0, [True] * num_envs, [[] for _ in range(num_envs)]

@@ -4,9 +4,13 @@ Difficulty rises in ``stages`` equal steps from 0, the easiest scenes, to 1, the
 object share the stage. It moves after a round, of which every environment counts its first episodes and no others: a
 window over the episodes that end first would hold the quick ones, which are successes.
 
+A share of the environments, the last ones, may draw from all that is easier than the stage instead. They decide on
+nothing, and keep in use what the earlier stages taught.
+
 A round can end in any step, and nothing here looks at values: see ``softgm_bench.rod.sync``.
 """
 
+import math
 from functools import lru_cache
 
 import torch
@@ -49,10 +53,15 @@ def difficulty(progress: Progress, config: CurriculumConfig) -> Tensor:
     return progress.stage[0].to(torch.float64) / config.stages
 
 
+def leading(num_envs: int, config: CurriculumConfig) -> int:
+    """Give the number of environments whose scenes are of the stage and whose episodes count: all but a share."""
+    return num_envs - math.floor(config.easier_share * num_envs)
+
+
 def note_ends(progress: Progress, ended: Tensor, success: Tensor, config: CurriculumConfig) -> Progress:
     """Count the episodes that have just ended and, when that settles the round, decide on the stage.
 
-    A round has at least ``episodes`` episodes, equally many of every environment. The stage rises by one if a larger
+    A round has at least ``episodes`` episodes, equally many of every leading environment. The stage rises by one if a larger
     share of them than ``promote`` are successes, and falls by one if a smaller share than ``demote`` are. The round is
     over as soon as the episodes under way cannot change that any more: it need not wait for the longest failures.
 
@@ -62,11 +71,13 @@ def note_ends(progress: Progress, ended: Tensor, success: Tensor, config: Curric
         success: of those that ended, ``(num_envs,)`` bool; anything elsewhere.
         config: thresholds.
     """
-    quota = -(-config.episodes // len(ended))
+    first = leading(len(ended), config)
+    quota = -(-config.episodes // first)
     counts = ended & progress.counting & (progress.counted < quota)
+    counts[first:].fill_(False)
     counted = progress.counted + counts
     succeeded = progress.succeeded + (counts & success)
-    total = quota * len(ended)
+    total = quota * first
     won, seen = succeeded.sum(), counted.sum()
     rises = won >= _fewest(total, config.promote, above=True)
     falls = won - seen < _fewest(total, config.demote, above=False) - total  # were all that is open won

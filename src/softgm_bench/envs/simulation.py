@@ -16,7 +16,7 @@ from tensordict import TensorClass, TensorDictBase
 from torch import Tensor
 
 from softgm_bench.envs import entries
-from softgm_bench.envs.curriculum import Progress, difficulty, first_progress, note_ends
+from softgm_bench.envs.curriculum import Progress, difficulty, first_progress, leading, note_ends
 from softgm_bench.envs.perturbation import Perturbation, PerturbationConfig
 from softgm_bench.envs.sensing import Bins, Sight, SlotTable, bins_per_cylinder, cut_into_bins, empty_table, look
 from softgm_bench.envs.tasks.base import Scene, Task
@@ -164,7 +164,7 @@ class Simulator:
         self._beginnings: dict[int, Beginning] = {}
         progress = first_progress(num_envs, device)
         nothing = torch.zeros((num_envs, 3), dtype=dtype, device=device)
-        fresh, _ = self.fresh(num_envs, progress)
+        fresh, _ = self.fresh(progress)
         self.state = Simulation(
             episodes=fresh.clone(), progress=progress, push=nothing, tip_force=nothing.clone(), batch_size=[num_envs]
         )
@@ -228,7 +228,7 @@ class Simulator:
     def begin(self, stagger: bool) -> None:
         """Begin a new episode in every environment; ``stagger`` starts the clocks at random steps."""
         state = self.state
-        state.episodes = self.fresh(len(state.push), state.progress)[0].clone()
+        state.episodes = self.fresh(state.progress)[0].clone()
         if stagger:
             state.episodes.steps.random_(0, self.horizon, generator=self._generator)
         state.progress.counting.fill_(not stagger)  # what is cut short says nothing about its scene
@@ -245,24 +245,25 @@ class Simulator:
         state.progress.counting.logical_or_(mask)
         self._push_anew(mask)
         if not sync.is_free(self.device):
-            fresh, sight = self.fresh(len(mask), state.progress)
+            fresh, sight = self.fresh(state.progress)
             state.episodes = fresh.where(mask, state.episodes)
             return None, fresh, sight
         rows = mask.nonzero().squeeze(-1)
-        fresh, sight = self.fresh(len(rows), state.progress)
+        fresh, sight = self.fresh(state.progress, rows)
         state.episodes[rows] = fresh
         return rows, fresh, sight
 
-    def fresh(self, count: int, progress: Progress) -> tuple[Episodes, Sight]:
-        """Make ``count`` episodes at their beginning, scenes drawn from the own generator, and what is sensed there.
+    def fresh(self, progress: Progress, rows: Tensor | None = None) -> tuple[Episodes, Sight]:
+        """Make episodes at their beginning, scenes drawn from the own generator, and what is sensed there.
 
+        For the environments ``rows``, ``(count,)``, or without them for all of ``progress``.
         Not to be changed in place: what does not depend on the scene is shared with other beginnings.
         """
-        config = self.task.config
-        level = difficulty(progress, config.curriculum) if self.curriculum else None
-        scene = self.task.sample(count, self._generator, level).apply(self._real)
-        bins = self._cut(scene)
+        count = len(progress.stage if rows is None else rows)
         blank = self._blank(count)
+        drawn, level = self._draw(count, progress, rows)
+        scene = drawn.apply(self._real)
+        bins = self._cut(scene)
         body = blank.body if self.randomise is None else draw(self.randomise, count, self._body_generator)
         episodes = Episodes(
             rod=blank.rod,
@@ -275,13 +276,32 @@ class Simulator:
             contact_steps=blank.table.count,
             terminated=blank.never,
             truncated=blank.never,
-            difficulty=blank.whole if level is None else level.to(torch.float32).expand(count),
+            difficulty=blank.whole if level is None else level.to(torch.float32),
             body=body,
             batch_size=[count],
         )
         sight = self.sense(episodes)
         self._note(episodes, sight)
         return episodes, sight
+
+    def _draw(self, count: int, progress: Progress, rows: Tensor | None) -> tuple[Scene, Tensor | None]:
+        """Draw ``count`` scenes, and give their difficulties, ``(count,)``; None without a curriculum.
+
+        Scenes of environments behind the leading ones share one difficulty, uniform below the stage's.
+        """
+        if not self.curriculum:
+            return self.task.sample(count, self._generator), None
+        config, num_envs = self.task.config.curriculum, len(progress.stage)
+        level = difficulty(progress, config)
+        scene = self.task.sample(count, self._generator, level)
+        first = leading(num_envs, config)
+        if first == num_envs:
+            return scene, level.expand(count)
+        share = torch.rand((), generator=self._generator, dtype=torch.float64, device=self.device)
+        environment = torch.arange(num_envs, device=self.device) if rows is None else rows
+        behind = environment >= first
+        easier = self.task.sample(count, self._generator, share * level)
+        return easier.where(behind, scene), torch.where(behind, share * level, level)
 
     def _blank(self, count: int) -> Beginning:
         """Give what ``count`` beginnings have in common; where all rows are made at every step, made only once."""

@@ -58,6 +58,7 @@ class CurriculumConfig:
     episodes: int
     promote: float
     demote: float
+    easier_share: float
 
     def __post_init__(self) -> None:
         """Refuse values by which nothing could be decided.
@@ -72,6 +73,10 @@ class CurriculumConfig:
             raise ValueError(
                 f"task.curriculum.demote is {self.demote}, task.curriculum.promote {self.promote}: "
                 "the first must be the smaller one, both at least 0 and below 1"
+            )
+        if not 0.0 <= self.easier_share < 1.0:
+            raise ValueError(
+                f"task.curriculum.easier_share is {self.easier_share}: it must be at least 0 and below 1"
             )
 
 
