@@ -122,11 +122,14 @@ def test_decisions_need_no_values_and_stay_on_their_device():
     num_envs=st.integers(1, 5),
     episodes=st.integers(1, 9),
     stages=st.integers(1, 3),
+    easier=st.sampled_from([0.0, 0.25, 0.5, 0.9]),
     steps=st.lists(st.tuples(st.integers(0, 31), st.integers(0, 31)), max_size=60),
 )
 @hypothesis_settings(max_examples=60, deadline=None)
-def test_any_course_of_events_is_decided_as_plain_counting_does(num_envs, episodes, stages, steps):
-    config = CurriculumConfig(enabled=True, stages=stages, episodes=episodes, promote=0.6, demote=0.2, easier_share=0.0)
+def test_any_course_of_events_is_decided_as_plain_counting_does(num_envs, episodes, stages, easier, steps):
+    config = dataclasses.replace(FOUR, stages=stages, episodes=episodes, easier_share=easier)
+    first = num_envs - int(easier * num_envs)  # the others count for nothing
+    quota = math.ceil(episodes / first)
     progress = first_progress(num_envs, torch.device("cpu"))
     progress.counting.fill_(True)
     stage, counting, results = 0, [True] * num_envs, [[] for _ in range(num_envs)]
@@ -134,11 +137,11 @@ def test_any_course_of_events_is_decided_as_plain_counting_does(num_envs, episod
         ended = [bool(ends >> env & 1) for env in range(num_envs)]
         won = [bool(wins >> env & 1) for env in range(num_envs)]
         progress = note_ends(progress, flags(*ended), flags(*won), config)
-        for env in range(num_envs):
-            if ended[env] and counting[env] and len(results[env]) < math.ceil(episodes / num_envs):
+        for env in range(first):
+            if ended[env] and counting[env] and len(results[env]) < quota:
                 results[env].append(won[env])
         every = [result for of_one in results for result in of_one]
-        total = num_envs * math.ceil(episodes / num_envs)
+        total = first * quota
         # whether the rest fails or succeeds
         worst, best = sum(every) / total, (total - len(every) + sum(every)) / total
         if worst > 0.6 or best < 0.2 or len(every) == total:
@@ -319,6 +322,8 @@ def test_targets_of_the_other_tasks_fill_ranges_between_the_easiest_and_their_ow
         ("task.curriculum.promote=0.1", r"task.curriculum.demote is 0.2, task.curriculum.promote 0.1"),
         ("task.curriculum.promote=1.0", r"task.curriculum.promote 1.0"),
         ("task.curriculum.demote=-0.1", r"task.curriculum.demote is -0.1"),
+        ("task.curriculum.easier_share=1.0", r"task.curriculum.easier_share is 1.0: it must be at least 0 and below 1"),
+        ("task.curriculum.easier_share=-0.1", r"task.curriculum.easier_share is -0.1"),
         ("task.curriculum.easy_opening_side=0.2", r"task.curriculum.easy_opening_side is 0.2"),
         ("task.curriculum.easy_target_offset=1.5", r"task.curriculum.easy_target_offset is 1.5: it must lie between"),
         ("task.curriculum.target_power=0.0", r"task.curriculum.target_power is 0.0: it must be above 0"),

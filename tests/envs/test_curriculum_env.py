@@ -1,5 +1,7 @@
 """A curriculum inside the environment: who has one, what it leaves alone, what is saved."""
 
+from contextlib import nullcontext
+
 import pytest
 import torch
 from torchrl.envs.utils import check_env_specs
@@ -162,6 +164,37 @@ def test_first_episodes_that_are_cut_short_count_for_nothing(build):
     state = env.simulation_state()["progress"]
     assert state["counting"].all()  # every first episode has ended
     assert not state["counted"].any()
+
+
+@pytest.mark.parametrize("dense", [False, True], ids=["rows", "all rows"])
+def test_environments_behind_the_leading_ones_draw_whole_scenes_of_lower_difficulties(build, dense):
+    env = build("wall", ENABLED, "task.curriculum.easier_share=0.5", num_envs=5, horizon=1)
+    with force_dense() if dense else nullcontext():
+        edit(env, lambda state: state["progress", "stage"].fill_(8))
+        drawn, td = [], env.reset()
+        for _ in range(12):  # too few episodes to settle a round
+            drawn.append((td[entries.DIFFICULTY].squeeze(-1), td[entries.PRIVILEGED][:, 3]))
+            _, td = advance(env, td)
+    difficulty, side = (torch.stack(values) for values in zip(*drawn, strict=True))
+    assert torch.allclose(difficulty[:, :3], torch.tensor(0.8))
+    behind = difficulty[:, 3:]
+    assert torch.equal(behind[:, 0], behind[:, 1])  # these begin in the same step
+    assert len(behind.unique()) == len(drawn)
+    assert behind.min() < 0.2 < 0.6 < behind.max() < 0.8
+    assert torch.allclose(side, 0.6 - 0.3 * difficulty)
+
+
+def test_only_leading_environments_decide_on_the_stage(build):
+    def stage_after(successes):
+        env = build("wall", ENABLED, ROUND, "task.curriculum.easier_share=0.5", horizon=1)
+        td = env.reset()
+        for _ in range(2):  # a round is two episodes of each of two environments
+            put_targets_at_the_tips(env, successes)
+            _, td = advance(env, td)
+        return env.simulation_state()["progress", "stage"].tolist()
+
+    assert stage_after([0, 1]) == [1] * 4
+    assert stage_after([0, 2, 3]) == [0] * 4
 
 
 @pytest.mark.parametrize("task", ["basic", "wall"])

@@ -61,9 +61,10 @@ def leading(num_envs: int, config: CurriculumConfig) -> int:
 def note_ends(progress: Progress, ended: Tensor, success: Tensor, config: CurriculumConfig) -> Progress:
     """Count the episodes that have just ended and, when that settles the round, decide on the stage.
 
-    A round has at least ``episodes`` episodes, equally many of every leading environment. The stage rises by one if a larger
-    share of them than ``promote`` are successes, and falls by one if a smaller share than ``demote`` are. The round is
-    over as soon as the episodes under way cannot change that any more: it need not wait for the longest failures.
+    A round has at least ``episodes`` episodes, equally many of every leading environment. The stage rises by one if a
+    larger share of them than ``promote`` are successes, and falls by one if a smaller share than ``demote`` are. The
+    round is over as soon as the episodes under way cannot change that any more: it need not wait for the longest
+    failures.
 
     Args:
         progress: not changed.

@@ -75,9 +75,7 @@ class CurriculumConfig:
                 "the first must be the smaller one, both at least 0 and below 1"
             )
         if not 0.0 <= self.easier_share < 1.0:
-            raise ValueError(
-                f"task.curriculum.easier_share is {self.easier_share}: it must be at least 0 and below 1"
-            )
+            raise ValueError(f"task.curriculum.easier_share is {self.easier_share}: it must be at least 0 and below 1")
 
 
 @dataclass
