@@ -153,12 +153,32 @@ def _check_one(config: Config) -> None:
                 "algo.critic.mlp: it reads the arm's observation, "
                 f"which task={config.task.name} has not; it must be null"
             )
+        if getattr(getattr(config.algo, "actor", None), "mirror", False):
+            _refuse_mirror(config, env.sizes.layout)
         encoder = build_encoder(config.model, env.sizes)
     except ValueError as error:
         raise UserError(str(error)) from error
     if not observed.issuperset(encoder.in_keys):
         fitting = FITTING.get(env.sizes.layout, "mlp or softgm")
         raise UserError(f"task={config.task.name} cannot be observed by this model: add model={fitting}")
+
+
+def _refuse_mirror(config: Config, layout: str) -> None:
+    """Refuse a mirrored policy where what it reads has no mirror image.
+
+    Raises:
+        ValueError: with one line naming the key, its value and what would be right.
+    """
+    if layout == VECTOR:
+        raise ValueError(
+            f"algo.actor.mirror is true: task={config.task.name} shows a plain vector, whose mirror image is unknown; "
+            "it must be false"
+        )
+    if config.oracle:
+        raise ValueError(
+            "algo.actor.mirror is true with observation=oracle: what an oracle is told has no known mirror image; "
+            "it must be false"
+        )
 
 
 def _refuse_previous_action(config: Config) -> None:

@@ -48,7 +48,7 @@ def test_a_run_from_before_there_were_named_recipes_is_the_same_run():
 
 def test_what_came_later_is_free_unless_it_changes_numbers():
     networks = {f"algo.{part}.{norm}_norm" for part in ("actor", "critic") for norm in ("embedding", "hidden")}
-    networks |= {"algo.actor.relative_points", "algo.actor.memory", "model.remember", "matmul"}
+    networks |= {"algo.actor.relative_points", "algo.actor.memory", "algo.actor.mirror", "model.remember", "matmul"}
     surfaces = {f"task.{name}_coefficient" for name in ("friction", "velocity_damping")}
     tasks = surfaces | {"task.max_contact_steps", "task.reward.lambda_fail"}
     tasks |= {f"task.curriculum.{name}" for name in ("easier_share", "easy_target_offset", "target_power")}

@@ -120,6 +120,7 @@ def actor_config(**changes):
         "hidden_norm": False,
         "relative_points": False,
         "memory": None,
+        "mirror": False,
     }
     return ActorConfig(**(values | changes))
 

@@ -19,7 +19,7 @@ from softgm_bench.algorithms.registry import register_algorithm
 from softgm_bench.envs import entries
 from softgm_bench.envs.interface import Environment, Sizes
 from softgm_bench.models.action_value import ACTION_VALUE, build_action_value
-from softgm_bench.models.heads import AgentHead, input_keys, told_points
+from softgm_bench.models.heads import AgentHead, Mirrored, input_keys, told_points
 from softgm_bench.models.memory import MemoryConfig
 from softgm_bench.models.registry import Encoder, build_encoder
 
@@ -34,6 +34,7 @@ class DeterministicActorConfig:
         hidden_norm: what enters each tanh of the head is normalised (paper: no); see ``models.heads.feedforward``.
         relative_points: an oracle's actor is told the privileged points relative to each agent too.
         memory: None; PPO alone trains recurrent actors.
+        mirror: the action commutes with the mirror in the plane y = 0 (paper: no); see ``models.heads.Mirrored``.
     """
 
     widths: list[int]
@@ -41,6 +42,7 @@ class DeterministicActorConfig:
     hidden_norm: bool
     relative_points: bool
     memory: MemoryConfig | None
+    mirror: bool
 
 
 @dataclass
@@ -69,9 +71,8 @@ class DeterministicPolicy(TensorDictModuleBase):
         """Put the policy's head on an encoder; ``actions`` is A, the numbers in one agent's action."""
         super().__init__()
         self.in_keys, self.out_keys = input_keys(encoder, n_privileged), [entries.ACTION]
-        self.head = AgentHead(
-            encoder, config.widths, actions, 0.01, n_privileged, n_points, hidden_norm=config.hidden_norm
-        )
+        head = AgentHead(encoder, config.widths, actions, 0.01, n_privileged, n_points, hidden_norm=config.hidden_norm)
+        self.head = Mirrored(head) if config.mirror else head
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write ``entries.ACTION``."""

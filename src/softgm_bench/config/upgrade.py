@@ -28,6 +28,7 @@ NEUTRAL: dict[str, Any] = {
     "algo.actor.relative_points": False,
     "model.remember": False,
     "algo.actor.memory": None,
+    "algo.actor.mirror": False,
 }
 ABLATIONS = ("softgm_no_stage1", "softgm_no_stage2")  # algorithms then, models of the algorithm softgm now
 

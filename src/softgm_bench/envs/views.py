@@ -3,13 +3,44 @@
 Shapes: ``...`` are any leading batch dimensions (time, environment), N agents, M obstacle slots.
 """
 
+from functools import lru_cache
+
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from softgm_bench.envs import entries
 
 CHANNELS = 15  # of an agent or a slot, without the paper's reserved zeros
+
+# What changes its sign in a mirror in the plane y = 0, along an entry's last dimension. A couple is an axial vector and
+# its binormal part, which bends the arm sideways, changes; directors at rest are the axes.
+MIRRORED: dict[NestedKey, tuple[float, ...]] = {
+    entries.AGENT_POSITION: (1.0, -1.0, 1.0),
+    entries.AGENT_VELOCITY: (1.0, -1.0, 1.0),
+    entries.PREVIOUS_ACTION: (1.0, -1.0),
+    entries.SLOT_DESCRIPTOR: (1.0, -1.0, 1.0, 1.0, -1.0, 1.0, 1.0, 1.0, 1.0),
+    entries.TIP: (1.0, -1.0, 1.0),
+    entries.TARGET: (1.0, -1.0, 1.0),
+}
+
+
+def mirrored(td: TensorDictBase) -> TensorDictBase:
+    """Give the observation in ``td`` as a mirror in the plane y = 0 shows it; slots stay in their places.
+
+    An arm that is moved by mirrored actions among mirrored obstacles observes this, bit by bit.
+    """
+    image = td.select(*entries.OBSERVATION)
+    for key, signs in MIRRORED.items():
+        value = image.get(key)
+        image.set(key, value * sign_vector(signs, value.device))
+    return image
+
+
+@lru_cache
+def sign_vector(signs: tuple[float, ...], device: torch.device) -> Tensor:
+    """Signs as float32, copied to the device once; not to be changed."""
+    return torch.tensor(signs, device=device)
 
 
 def agent_channels(td: TensorDictBase, velocity_scale: float = 1.0) -> Tensor:

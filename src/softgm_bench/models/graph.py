@@ -15,11 +15,14 @@ from torch import Tensor
 from softgm_bench.envs import entries
 from softgm_bench.envs.views import (
     CHANNELS,
+    MIRRORED,
     agent_channels,
     flat_features,
     flat_observation,
+    mirrored,
     obstacle_channels,
     relative_points,
+    sign_vector,
     slot_channels,
 )
 
@@ -29,6 +32,7 @@ AGENT, OBSTACLE, PAD = 0, 1, 2  # node types
 __all__ = [  # with the views, so that models name one module
     "AGENT",
     "CHANNELS",
+    "MIRRORED",
     "NODE_FEATURES",
     "OBSTACLE",
     "PAD",
@@ -43,11 +47,13 @@ __all__ = [  # with the views, so that models name one module
     "flat_observation",
     "full_adjacency",
     "heard_slots",
+    "mirrored",
     "node_types",
     "obstacle_channels",
     "pad_channels",
     "relative_points",
     "sense",
+    "sign_vector",
     "slot_channels",
     "slot_features",
     "without_empty_slots",

@@ -55,6 +55,7 @@ class ActorConfig:
         hidden_norm: what enters each tanh of the head is normalised (paper: no); see ``feedforward``.
         relative_points: an oracle's actor is told the privileged points relative to each agent too.
         memory: each agent remembers, by a recurrent cell before the head; None: it does not (paper).
+        mirror: the mean commutes with the mirror in the plane y = 0 (paper: no); see ``Mirrored``.
     """
 
     widths: list[int]
@@ -68,6 +69,7 @@ class ActorConfig:
     hidden_norm: bool
     relative_points: bool
     memory: MemoryConfig | None
+    mirror: bool
 
     def __post_init__(self) -> None:
         """Refuse values that give no policy.
@@ -84,6 +86,8 @@ class ActorConfig:
             raise ValueError(f"algo.actor.mean_bound is {self.mean_bound}: it must be above 0")
         if not 0.0 <= self.persistence < 1.0:
             raise ValueError(f"algo.actor.persistence is {self.persistence}: it must be at least 0 and below 1")
+        if self.mirror and self.memory is not None:
+            raise ValueError("algo.actor.mirror is true: what is remembered has no mirror image, memory must be null")
 
 
 @dataclass
@@ -202,6 +206,29 @@ class AgentHead(nn.Module):
         return own if self.memory is None else torch.cat([own, self.memory(td, own)], dim=-1)
 
 
+class Mirrored(nn.Module):
+    """A head f made to commute with the mirror in the plane y = 0: ``(f(o) + S f(M o)) / 2``.
+
+    M mirrors the observation, S what f says of actions, whose binormal part changes its sign. On every task of the arm
+    a scene is as likely as its mirror image, so there is a best policy that commutes with it. An ordinary network has
+    to learn each side by itself, and may settle on one. This one bends to neither where a scene looks the same in the
+    mirror.
+    """
+
+    def __init__(self, head: AgentHead) -> None:
+        """Mirror ``head``, whose outputs are an agent's action and, where there are more, even functions."""
+        super().__init__()
+        self.head = head
+        outputs = head.function[-1].out_features
+        signs = graph.MIRRORED[entries.PREVIOUS_ACTION]
+        self.signs = (*signs, *[1.0] * (outputs - len(signs)))
+
+    def forward(self, td: TensorDictBase) -> Tensor:
+        """``(..., N, outputs)``."""
+        here, there = self.head(td), self.head(graph.mirrored(td))
+        return 0.5 * (here + there * graph.sign_vector(self.signs, there.device))
+
+
 @torch.no_grad()
 def actor_saturation(policy: nn.Module, batch: TensorDictBase) -> dict[str, float]:
     """Tell how far the first tanh of an actor's head is driven, over evenly spaced frames of a batch.
@@ -238,11 +265,12 @@ class GaussianPolicy(TensorDictModuleBase):
         """Put the policy's head on an encoder; ``actions`` is A, the numbers in one agent's action."""
         super().__init__()
         outputs = 2 * actions if config.state_dependent_sigma else actions
-        self.head = AgentHead(
+        head = AgentHead(
             encoder, config.widths, outputs, 0.01, n_privileged, n_points, config.memory, config.hidden_norm
         )
-        memory = self.head.memory
-        self.in_keys, self.out_keys = self.head.in_keys, [LOC, SCALE, *([] if memory is None else memory.out_keys)]
+        self.in_keys = head.in_keys
+        self.out_keys = [LOC, SCALE, *([] if head.memory is None else head.memory.out_keys)]
+        self.head = Mirrored(head) if config.mirror else head
         self.persistence = config.persistence
         self.low, self.range = math.log(config.min_sigma), math.log(config.max_sigma / config.min_sigma)
         fraction = torch.tensor((math.log(config.initial_sigma) - self.low) / self.range)
