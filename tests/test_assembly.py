@@ -62,3 +62,22 @@ def test_a_memory_needs_an_environment_that_hands_it_on(monkeypatch):
     monkeypatch.setattr(assembly, "RememberingEnv", int)  # as if the environment were another kind's
     with pytest.raises(UserError, match=r"^algo\.actor\.memory: task=basic hands no memory on [^\n]*$"):
         configure(remembers)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["task=basic", "algo=mappo", "algo.actor.memory={cell:gru,size:8}"], "memory must be null"),
+        (["task=wall", "algo=isac", "observation=oracle"], "observation=oracle.* must be false"),
+        (
+            ["task=vmas_balance", "algo=ippo", "model=vector_mlp", "algo.actor.persistence=0"],
+            "vector.* must be false",
+        ),
+    ],
+)
+def test_a_policy_is_mirrored_only_where_what_it_reads_has_a_mirror_image(overrides, message):
+    if overrides[0].startswith("task=vmas"):
+        pytest.importorskip("vmas", reason="VMAS is an optional extra: pip install 'softgm-bench[vmas]'")
+    configure([*overrides, "algo.actor.mirror=false"])
+    with pytest.raises(UserError, match=rf"^algo\.actor\.mirror is true[^\n]*{message}$"):
+        configure([*overrides, "algo.actor.mirror=true"])

@@ -8,7 +8,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from off_policy_cases import SHORT, SMALL, batches, filled, says, three_ends
 from softgm_bench.algorithms.ddpg import DDPG, DDPGConfig
 from softgm_bench.algorithms.off_policy import AGENT_REWARD
-from softgm_bench.envs import entries, make_env
+from softgm_bench.envs import entries, make_env, views
 from softgm_bench.models.action_value import ACTION_VALUE
 from softgm_bench.models.mlp import MLPConfig
 
@@ -36,6 +36,19 @@ def test_targets_bootstrap_at_a_truncation_and_not_at_a_termination(build, name)
     assert losses["target_value"].T.tolist() == [[2.0, 4.0, 5.0]] * 6
     assert losses["loss_value"].item() == pytest.approx((4 + 16 + 25) / 3)
     assert losses["loss_actor"].item() == 0.0
+
+
+@pytest.mark.parametrize("name", ["iddpg", "maddpg"])
+def test_a_mirrored_policy_does_in_the_mirror_what_mirrors_its_actions(build, name):
+    algorithm, env = build(name, "algo.actor.mirror=true", task="wall")
+    with torch.no_grad():
+        for parameter in algorithm.policy.parameters():
+            parameter.normal_(std=0.1)
+        td = env.rollout(3, auto_reset=True)
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            here, there = (algorithm.policy(seen)[entries.ACTION] for seen in (td.clone(), views.mirrored(td)))
+    torch.testing.assert_close(there, here * torch.tensor([1.0, -1.0]), rtol=1e-5, atol=1e-6)
+    assert here.abs().min() > 1e-5
 
 
 def test_the_target_network_follows_softly(build):

@@ -9,6 +9,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from softgm_bench.envs import entries
 from softgm_bench.models import MLPConfig, MLPEncoder, build_actor, build_value, graph
 from softgm_bench.models.heads import LOC, POOLINGS, SATURATION_FRAMES, SCALE, STATE_VALUE, actor_saturation
+from softgm_bench.models.memory import MemoryConfig
 from softgm_bench.models.mlp import MLPTeamEncoder
 from softgm_bench.models.registry import Normalised, NormalisedTeam
 
@@ -212,6 +213,53 @@ def test_only_an_oracles_actor_is_told_points():
         policy = build_actor(softgm_config(), sizes, actor_config(relative_points=relative))
         assert set(policy.in_keys) == set(entries.OBSERVATION)
         assert policy.module[0].head.function[0].in_features == graph.CHANNELS + 8
+
+
+BINORMAL = torch.tensor([1.0, -1.0])  # what bends the arm sideways
+
+
+@ENCODERS
+@pytest.mark.parametrize("state_dependent_sigma", [False, True])
+@pytest.mark.parametrize("persistence", [0.0, 0.5])
+def test_a_mirrored_policy_does_in_the_mirror_what_mirrors_its_actions(encoder, state_dependent_sigma, persistence):
+    policy = actor(encoder, mirror=True, state_dependent_sigma=state_dependent_sigma, persistence=persistence)
+    randomise(policy)
+    td = observation((2, 3))
+    here, there = policy.module[0](td.clone()), policy.module[0](graph.mirrored(td))
+    torch.testing.assert_close(there[LOC], here[LOC] * BINORMAL, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(there[SCALE], here[SCALE], rtol=1e-5, atol=0.0)
+    assert here[LOC].abs().min() > 1e-4
+    plain = actor(encoder, state_dependent_sigma=state_dependent_sigma, persistence=persistence)
+    randomise(plain)
+    there = plain.module[0](graph.mirrored(td))
+    assert not torch.allclose(there[LOC], plain.module[0](td.clone())[LOC] * BINORMAL, rtol=0.1)
+
+
+@ENCODERS
+def test_a_mirrored_policy_bends_to_neither_side_where_both_look_the_same(encoder):
+    policy = actor(encoder, mirror=True)
+    randomise(policy)
+    td = observation((7,))
+    for key, signs in graph.MIRRORED.items():
+        td[key] = td[key] * (torch.tensor(signs) > 0)  # all in the plane
+    loc = policy.module[0](td)[LOC]
+    assert torch.equal(loc[..., 1], torch.zeros_like(loc[..., 1]))
+    assert loc[..., 0].abs().min() > 1e-4
+
+
+def test_a_mirrored_policy_changes_nothing_that_it_reads_and_its_saturation_is_told():
+    policy = actor(mirror=True)
+    td = observation((6, 4))
+    read = td.clone()
+    policy(td)
+    for key in entries.OBSERVATION:
+        assert torch.equal(td[key], read[key])
+    assert actor_saturation(policy, td).keys() == {"actor_saturation", "actor_preactivation"}
+
+
+def test_a_policy_that_remembers_is_not_mirrored():
+    with pytest.raises(ValueError, match=r"algo\.actor\.mirror is true: .* memory must be null"):
+        actor_config(mirror=True, memory=MemoryConfig(cell="gru", size=4))
 
 
 def test_an_unknown_pooling_is_refused():

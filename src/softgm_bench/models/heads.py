@@ -164,6 +164,7 @@ class AgentHead(nn.Module):
 
     Attributes:
         in_keys: the entries that are read.
+        out_features: numbers that f gives an agent.
     """
 
     def __init__(
@@ -183,7 +184,7 @@ class AgentHead(nn.Module):
         """
         super().__init__()
         self.encoder = encoder
-        self.n_privileged, self.n_points = n_privileged, n_points
+        self.out_features, self.n_privileged, self.n_points = out_features, n_privileged, n_points
         in_features = encoder.own_features + encoder.out_features + n_privileged + 3 * n_points
         self.memory = None if memory is None else Memory(memory, in_features)
         in_features += 0 if memory is None else memory.size
@@ -219,9 +220,8 @@ class Mirrored(nn.Module):
         """Mirror ``head``, whose outputs are an agent's action and, where there are more, even functions."""
         super().__init__()
         self.head = head
-        outputs = head.function[-1].out_features
         signs = graph.MIRRORED[entries.PREVIOUS_ACTION]
-        self.signs = (*signs, *[1.0] * (outputs - len(signs)))
+        self.signs = (*signs, *[1.0] * (head.out_features - len(signs)))
 
     def forward(self, td: TensorDictBase) -> Tensor:
         """``(..., N, outputs)``."""
