@@ -3,13 +3,14 @@
 import csv
 import json
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from committed import ROOT, script
 from softgm_bench.analysis.statistics import mcnemar
-from softgm_bench.episodes import certified
+from softgm_bench.episodes import certified, policy
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +62,10 @@ SENSING = {  # rows of the page: folders
     "SoftGM, seed 0, `promote=0.75`": "trials/wall_sense/seed0_promote-0.75",
     "SoftGM, seed 0, `promote=0.75`, `demote=0.5`": "trials/wall_sense/seed0_promote-0.75_demote-0.5",
     "SoftGM, seed 1, `promote=0.75`": "trials/wall_sense/seed1_promote-0.75",
+    "SoftGM, seed 0, `easier_share=0.5`": "trials/wall_sense/seed0_share-0.5",
+    "SoftGM, seed 1, `easier_share=0.5`": "trials/wall_sense/seed1_share-0.5",
+    "SoftGM, seed 0, `mirror`": "trials/wall_sense/seed0_mirror",
+    "SoftGM, seed 1, `mirror`": "trials/wall_sense/seed1_mirror",
 }
 
 
@@ -112,6 +117,30 @@ def test_what_is_said_of_a_curriculum_that_goes_back_is_what_its_trial_holds(res
     told = ", ".join(f"{curve[number]:.2f}" for number in (5, 6, 7))
     page = " ".join(results.PAGE.read_text().split())
     assert f"{told} of 256 scenes after 1.25, 1.5, 1.75 million frames" in page
+
+
+def test_what_is_said_of_the_mirror_is_what_its_trials_hold(results):
+    curve = script(ROOT / "experiments" / "trials.py").curve
+    names = ("SoftGM, seed 0, `mirror`", "SoftGM, seed 1, `mirror`", "SoftGM, seed 0", "SoftGM, seed 1")
+    half = [f"{curve(ROOT / 'experiments' / SENSING[name])[2]:.2f}" for name in names]
+    page = " ".join(results.PAGE.read_text().split())
+    assert "succeed in {} and {} of the scenes, without it in {} and {}.".format(*half) in page
+    last = max(curve(ROOT / "experiments" / SENSING[names[1]]).items())
+    assert last[0] == 6
+    assert f"{last[1]:.2f} of 256 scenes after 1.5 million frames" in page
+
+
+def test_the_table_of_sides_is_that_of_the_committed_figures_of_the_kept_policies():
+    sides = script(ROOT / "experiments" / "sides.py")
+    text = sides.PAGE.read_text()
+    assert sides.page(text) == text
+    held = {figures["name"]: figures for figures in map(json.loads, map(Path.read_text, sides.FOLDER.glob("*.json")))}
+    assert held.keys() > sides.POLICIES.keys()
+    for name, path in sides.POLICIES.items():
+        assert held[name]["parameters"] == policy.fingerprint(policy.load(path))
+    for figures in held.values():
+        assert (figures["seed"], figures["episodes"]) == (sides.SEED, sides.EPISODES)
+        assert len(figures["shares"]) == len(sides.COLUMNS)
 
 
 def test_what_is_said_of_the_curriculum_is_what_the_committed_trainings_hold(results):
