@@ -59,7 +59,11 @@ def play(trained: TrainedPolicy) -> list[float | None]:
     open_side, targets_side = told[:, 0], target[:, 0]
     same, success = open_side == targets_side, ever[entries.SUCCESS]
     return [
-        *(share((tip[:, step] == side)[first[:, step]]) for side in (targets_side, open_side) for step in STEPS),
+        *(
+            share((tip[:, step - 1] == side)[first[:, step - 1]])
+            for side in (targets_side, open_side)
+            for step in STEPS
+        ),
         share(success[same]),
         share(success[~same]),
         share(ever[entries.CONTACT_FAILURE][~success]),
@@ -83,8 +87,12 @@ def page(text: str) -> str:
 def main(arguments: list[str]) -> None:
     """Play what is missing, and rewrite the table."""
     set_threads(1, None)
-    given = dict(argument.split("=", 1) for argument in arguments)
-    for name, path in (POLICIES | {name: Path(path) for name, path in given.items()}).items():
+    FOLDER.mkdir(exist_ok=True)
+    unread = next((argument for argument in arguments if "=" not in argument), None)
+    if unread is not None:
+        raise UserError(f"{unread}: policies are given as NAME=POLICY.pt")
+    given = {name: Path(path) for name, _, path in (argument.partition("=") for argument in arguments)}
+    for name, path in (POLICIES | given).items():
         file = FOLDER / f"{name.replace(', ', '_').replace(' ', '-')}.json"
         if not file.exists():
             trained = load(path)

@@ -119,6 +119,16 @@ def test_what_is_said_of_a_curriculum_that_goes_back_is_what_its_trial_holds(res
     assert f"{told} of 256 scenes after 1.25, 1.5, 1.75 million frames" in page
 
 
+def test_easier_scenes_were_stopped_when_the_page_says(results):
+    frames = []
+    for seed in (0, 1):
+        folder = ROOT / "experiments" / SENSING[f"SoftGM, seed {seed}, `easier_share=0.5`"]
+        with (folder / "metrics.csv").open() as file:
+            frames.append(int(list(csv.DictReader(file))[-1]["frames"]) / 1e6)
+    told = "stopped after {:.2f} and {:.2f} million frames): a target".format(*frames)
+    assert told in " ".join(results.PAGE.read_text().split())
+
+
 def test_what_is_said_of_the_mirror_is_what_its_trials_hold(results):
     curve = script(ROOT / "experiments" / "trials.py").curve
     names = ("SoftGM, seed 0, `mirror`", "SoftGM, seed 1, `mirror`", "SoftGM, seed 0", "SoftGM, seed 1")

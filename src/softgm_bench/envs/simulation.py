@@ -297,11 +297,11 @@ class Simulator:
         first = leading(num_envs, config)
         if first == num_envs:
             return scene, level.expand(count)
-        share = torch.rand((), generator=self._generator, dtype=torch.float64, device=self.device)
+        below = level * torch.rand((), generator=self._generator, dtype=torch.float64, device=self.device)
         environment = torch.arange(num_envs, device=self.device) if rows is None else rows
         behind = environment >= first
-        easier = self.task.sample(count, self._generator, share * level)
-        return easier.where(behind, scene), torch.where(behind, share * level, level)
+        easier = self.task.sample(count, self._generator, below)
+        return easier.where(behind, scene), torch.where(behind, below, level)
 
     def _blank(self, count: int) -> Beginning:
         """Give what ``count`` beginnings have in common; where all rows are made at every step, made only once."""
