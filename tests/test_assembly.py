@@ -5,6 +5,7 @@ from softgm_bench import assembly
 from softgm_bench.algorithms import algorithm_configs
 from softgm_bench.assembly import build_algorithm, build_env, build_policy, configure
 from softgm_bench.envs import Environment, SoftArmEnv, kind_of
+from softgm_bench.envs.tasks.wall import Wall
 from softgm_bench.episodes import policy
 from softgm_bench.errors import UserError
 from softgm_bench.runs.loop import train
@@ -64,20 +65,17 @@ def test_a_memory_needs_an_environment_that_hands_it_on(monkeypatch):
         configure(remembers)
 
 
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (["task=basic", "algo=mappo", "algo.actor.memory={cell:gru,size:8}"], "memory must be null"),
-        (["task=wall", "algo=isac", "observation=oracle"], "observation=oracle.* must be false"),
-        (
-            ["task=vmas_balance", "algo=ippo", "model=vector_mlp", "algo.actor.persistence=0"],
-            "vector.* must be false",
-        ),
-    ],
-)
-def test_a_policy_is_mirrored_only_where_what_it_reads_has_a_mirror_image(overrides, message):
-    if overrides[0].startswith("task=vmas"):
-        pytest.importorskip("vmas", reason="VMAS is an optional extra: pip install 'softgm-bench[vmas]'")
-    configure([*overrides, "algo.actor.mirror=false"])
-    with pytest.raises(UserError, match=rf"^algo\.actor\.mirror is true[^\n]*{message}$"):
-        configure([*overrides, "algo.actor.mirror=true"])
+def test_an_oracle_is_mirrored_only_where_its_task_says_what_mirrors_what_it_is_told(monkeypatch):
+    mirrored = ["task=wall", "algo=isac", "observation=oracle", "algo.actor.mirror=true"]
+    configure(mirrored)
+    monkeypatch.setattr(Wall, "privileged_image", ())
+    with pytest.raises(UserError, match=r"^algo\.actor\.mirror is true with observation=oracle: task=wall [^\n]*$"):
+        configure(mirrored)
+
+
+def test_a_plain_vector_has_no_mirror_image():
+    pytest.importorskip("vmas", reason="VMAS is an optional extra: pip install 'softgm-bench[vmas]'")
+    vector = ["task=vmas_balance", "algo=ippo", "model=vector_mlp", "algo.actor.persistence=0"]
+    configure(vector)
+    with pytest.raises(UserError, match=r"^algo\.actor\.mirror is true[^\n]*vector.* must be false$"):
+        configure([*vector, "algo.actor.mirror=true"])

@@ -154,7 +154,7 @@ def _check_one(config: Config) -> None:
                 f"which task={config.task.name} has not; it must be null"
             )
         if getattr(getattr(config.algo, "actor", None), "mirror", False):
-            _refuse_mirror(config, env.sizes.layout)
+            _refuse_mirror(config, env.sizes)
         encoder = build_encoder(config.model, env.sizes)
     except ValueError as error:
         raise UserError(str(error)) from error
@@ -163,21 +163,21 @@ def _check_one(config: Config) -> None:
         raise UserError(f"task={config.task.name} cannot be observed by this model: add model={fitting}")
 
 
-def _refuse_mirror(config: Config, layout: str) -> None:
+def _refuse_mirror(config: Config, sizes: Sizes) -> None:
     """Refuse a mirrored policy where what it reads has no mirror image.
 
     Raises:
         ValueError: with one line naming the key, its value and what would be right.
     """
-    if layout == VECTOR:
+    if sizes.layout == VECTOR:
         raise ValueError(
             f"algo.actor.mirror is true: task={config.task.name} shows a plain vector, whose mirror image is unknown; "
             "it must be false"
         )
-    if config.oracle:
+    if config.oracle and len(sizes.privileged_image) != sizes.n_privileged:
         raise ValueError(
-            "algo.actor.mirror is true with observation=oracle: what an oracle is told has no known mirror image; "
-            "it must be false"
+            f"algo.actor.mirror is true with observation=oracle: task={config.task.name} does not say what mirrors "
+            "the numbers that an oracle is told (privileged_image); it must be false"
         )
 
 

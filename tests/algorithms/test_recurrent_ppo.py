@@ -22,6 +22,7 @@ CASES = pytest.mark.parametrize(
         ("softgm", "wall", "softgm"),
         ("mappo", "structured", "mlp"),
         ("ippo", "wall", "mlp"),
+        ("softgm algo.actor.mirror=true", "wall", "softgm"),
         ("ippo", "vmas_balance", "vector_mlp"),
     ],
 )
@@ -34,7 +35,7 @@ def build():
     def algorithm(algo="mappo", task="basic", model="mlp", *overrides):
         if task.startswith("vmas"):
             pytest.importorskip("vmas", reason="VMAS is an optional extra: pip install 'softgm-bench[vmas]'")
-        settings = [f"algo={algo}", f"task={task}", f"model={model}", "recipe=paper", "rod.n_elements=20", GRU]
+        settings = [*f"algo={algo}".split(), f"task={task}", f"model={model}", "recipe=paper", "rod.n_elements=20", GRU]
         config = configure([*settings, "algo.epochs=2", "algo.minibatch_size=16", *overrides])
         torch.manual_seed(0)
         env = build_env(config, 6, 0, 5, training=True)

@@ -257,9 +257,48 @@ def test_a_mirrored_policy_changes_nothing_that_it_reads_and_its_saturation_is_t
     assert actor_saturation(policy, td).keys() == {"actor_saturation", "actor_preactivation"}
 
 
-def test_a_policy_that_remembers_is_not_mirrored():
-    with pytest.raises(ValueError, match=r"algo\.actor\.mirror is true: .* memory must be null"):
-        actor_config(mirror=True, memory=MemoryConfig(cell="gru", size=4))
+@ENCODERS
+def test_a_mirrored_policy_that_remembers_does_in_the_mirror_what_mirrors_its_actions(encoder):
+    """Step after step, episodes that begin in between, and in one go; what it remembers are both sides, exchanged."""
+    policy = actor(encoder, mirror=True, memory=MemoryConfig(cell="gru", size=4))
+    randomise(policy)
+    frames = observation((3, 6))
+    frames[entries.IS_INIT] = torch.rand(3, 6, 1, generator=torch.Generator().manual_seed(0)) < 0.3
+    image = graph.mirrored(frames).set(entries.IS_INIT, frames[entries.IS_INIT])
+    means = []
+    for seen in (frames, image):
+        state, of_steps = None, []
+        for step in range(6):
+            td = seen[:, step].clone()
+            if state is not None:
+                td.set(entries.MEMORY, state)
+            of_steps.append(policy.module[0](td)[LOC])
+            state = td[entries.NEXT_MEMORY]
+            assert state.shape == (3, 4, 8)
+        whole = seen.clone()
+        torch.testing.assert_close(policy.module[0](whole)[LOC], torch.stack(of_steps, 1), rtol=1e-5, atol=1e-6)
+        assert "next" not in whole.keys()  # noqa: SIM118
+        means.append((torch.stack(of_steps, 1), state))
+    (here, kept), (there, other) = means
+    torch.testing.assert_close(there, here * BINORMAL, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(other, kept.roll(4, dims=-1), rtol=1e-5, atol=1e-6)
+    forgotten = frames.clone().set(entries.IS_INIT, torch.ones_like(frames[entries.IS_INIT]))
+    assert not torch.allclose(policy.module[0](forgotten)[LOC], here, atol=1e-3)
+    assert actor_saturation(policy, policy(frames.clone())).keys() == {"actor_saturation", "actor_preactivation"}
+
+
+def test_a_mirrored_oracle_does_in_the_mirror_what_mirrors_its_actions():
+    image = ((3, 1.0), (4, -1.0), (5, 1.0), (0, 1.0), (1, -1.0), (2, 1.0), (6, -1.0))  # two points change places
+    sizes = replace(SIZES, n_privileged=7, n_points=2, privileged_image=image)
+    torch.manual_seed(0)
+    policy = build_actor(softgm_config(), sizes, actor_config(mirror=True, relative_points=True), sizes.n_privileged)
+    randomise(policy)
+    td = observation((5,))
+    td[entries.PRIVILEGED] = torch.randn(5, 7)
+    here, there = policy.module[0](td.clone()), policy.module[0](graph.mirrored(td, image))
+    torch.testing.assert_close(there[LOC], here[LOC] * BINORMAL, rtol=1e-5, atol=1e-6)
+    unaware = graph.mirrored(td, image).set(entries.PRIVILEGED, td[entries.PRIVILEGED])
+    assert not torch.allclose(policy.module[0](unaware)[LOC], there[LOC], atol=1e-3)
 
 
 def test_an_unknown_pooling_is_refused():

@@ -19,7 +19,7 @@ from softgm_bench.algorithms.registry import register_algorithm
 from softgm_bench.envs import entries
 from softgm_bench.envs.interface import Environment, Sizes
 from softgm_bench.models.action_value import ACTION_VALUE, build_action_value
-from softgm_bench.models.heads import AgentHead, Mirrored, input_keys, told_points
+from softgm_bench.models.heads import build_head
 from softgm_bench.models.memory import MemoryConfig
 from softgm_bench.models.registry import Encoder, build_encoder
 
@@ -60,19 +60,11 @@ class DDPGConfig(OffPolicyConfig):
 class DeterministicPolicy(TensorDictModuleBase):
     """Writes ``entries.ACTION`` = tanh(f([o_i || g_i])), ``(..., N, 2)``; parameters shared by all agents."""
 
-    def __init__(
-        self,
-        encoder: Encoder,
-        actions: int,
-        config: DeterministicActorConfig,
-        n_privileged: int = 0,
-        n_points: int = 0,
-    ) -> None:
-        """Put the policy's head on an encoder; ``actions`` is A, the numbers in one agent's action."""
+    def __init__(self, encoder: Encoder, sizes: Sizes, config: DeterministicActorConfig, n_privileged: int = 0) -> None:
+        """Put the policy's head on an encoder."""
         super().__init__()
-        self.in_keys, self.out_keys = input_keys(encoder, n_privileged), [entries.ACTION]
-        head = AgentHead(encoder, config.widths, actions, 0.01, n_privileged, n_points, hidden_norm=config.hidden_norm)
-        self.head = Mirrored(head) if config.mirror else head
+        self.head = build_head(encoder, sizes, config, sizes.action, n_privileged)
+        self.in_keys, self.out_keys = self.head.in_keys, [entries.ACTION]
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write ``entries.ACTION``."""
@@ -124,8 +116,7 @@ class DDPG(OffPolicy):
         """Build the actor alone; see ``algorithms.build_policy``."""
         known = sizes.n_privileged if oracle else 0
         encoder = build_encoder(model_config, sizes, config.actor.embedding_norm)
-        points = told_points(config.actor, sizes, known)
-        actor = DeterministicPolicy(encoder, sizes.action, config.actor, known, points)
+        actor = DeterministicPolicy(encoder, sizes, config.actor, known)
         return NoisyExplorer(actor, sizes.action, config, frames)
 
     def __init__(self, config: DDPGConfig, model_config: Any, env: Environment, oracle: bool = False) -> None:

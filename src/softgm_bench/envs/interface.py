@@ -26,6 +26,8 @@ class Sizes:
         n_features: length of an agent's observation where it is a plain vector, F; 0 for a graph observation.
         n_privileged: numbers that the task knows of a scene beyond the observation, P.
         n_points: points among them, m; the first ``3 n_points`` numbers are their coordinates.
+        privileged_image: what a mirror in the plane y = 0 makes of them: for each number of the image the index of the
+            number that is there, and the sign that it gets. Empty where that is not known.
     """
 
     n_agents: int
@@ -34,6 +36,7 @@ class Sizes:
     n_features: int = 0
     n_privileged: int = 0
     n_points: int = 0
+    privileged_image: tuple[tuple[int, float], ...] = ()
 
     @property
     def layout(self) -> str:

@@ -28,7 +28,14 @@ def sizes_of(task: Task) -> Sizes:
     """Give the sizes of a task's actions and observations; of a mixture, those of the arms with most sections."""
     n_slots = task.config.slots if task.max_cylinders else 0
     n_agents = max(numbers_of(task.config), default=task.config.n_agents)
-    return Sizes(n_agents, DIRECTIONS, n_slots=n_slots, n_privileged=task.n_privileged, n_points=task.n_points)
+    return Sizes(
+        n_agents,
+        DIRECTIONS,
+        n_slots=n_slots,
+        n_privileged=task.n_privileged,
+        n_points=task.n_points,
+        privileged_image=task.privileged_image,
+    )
 
 
 class SoftArmEnv(RememberingEnv):

@@ -3,6 +3,7 @@
 Shapes: ``...`` are any leading batch dimensions (time, environment), N agents, M obstacle slots.
 """
 
+from collections.abc import Sequence
 from functools import lru_cache
 
 import torch
@@ -25,16 +26,26 @@ MIRRORED: dict[NestedKey, tuple[float, ...]] = {
 }
 
 
-def mirrored(td: TensorDictBase) -> TensorDictBase:
+def mirrored(td: TensorDictBase, privileged_image: Sequence[tuple[int, float]] = ()) -> TensorDictBase:
     """Give the observation in ``td`` as a mirror in the plane y = 0 shows it; slots stay in their places.
 
-    An arm that is moved by mirrored actions among mirrored obstacles observes this, bit by bit.
+    An arm that is moved by mirrored actions among mirrored obstacles observes this, bit by bit. With a
+    ``privileged_image`` (``interface.Sizes``) the image has the privileged numbers too.
     """
     image = td.select(*entries.OBSERVATION)
+    if privileged_image:
+        known, (order, signs) = td.get(entries.PRIVILEGED), zip(*privileged_image, strict=True)
+        image.set(entries.PRIVILEGED, known[..., index_vector(order, known.device)] * sign_vector(signs, known.device))
     for key, signs in MIRRORED.items():
         value = image.get(key)
         image.set(key, value * sign_vector(signs, value.device))
     return image
+
+
+@lru_cache
+def index_vector(indices: tuple[int, ...], device: torch.device) -> Tensor:
+    """Indices as int64, copied to the device once; not to be changed."""
+    return torch.tensor(indices, device=device)
 
 
 @lru_cache

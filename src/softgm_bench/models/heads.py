@@ -86,8 +86,6 @@ class ActorConfig:
             raise ValueError(f"algo.actor.mean_bound is {self.mean_bound}: it must be above 0")
         if not 0.0 <= self.persistence < 1.0:
             raise ValueError(f"algo.actor.persistence is {self.persistence}: it must be at least 0 and below 1")
-        if self.mirror and self.memory is not None:
-            raise ValueError("algo.actor.mirror is true: what is remembered has no mirror image, memory must be null")
 
 
 @dataclass
@@ -213,20 +211,69 @@ class Mirrored(nn.Module):
     M mirrors the observation, S what f says of actions, whose binormal part changes its sign. On every task of the arm
     a scene is as likely as its mirror image, so there is a best policy that commutes with it. An ordinary network has
     to learn each side by itself, and may settle on one. This one bends to neither where a scene looks the same in the
-    mirror.
+    mirror. A head with a memory has two hidden states side by side, of what it saw and of the image of that.
     """
 
-    def __init__(self, head: AgentHead) -> None:
-        """Mirror ``head``, whose outputs are an agent's action and, where there are more, even functions."""
+    def __init__(self, head: AgentHead, privileged_image: Sequence[tuple[int, float]] = ()) -> None:
+        """Mirror ``head``, whose outputs are an agent's action and, where there are more, even functions.
+
+        One that reads privileged numbers needs their ``privileged_image`` (``interface.Sizes``).
+        """
         super().__init__()
-        self.head = head
+        self.head, self.in_keys = head, head.in_keys
+        self.privileged_image = tuple(privileged_image) if head.n_privileged else ()
         signs = graph.MIRRORED[entries.PREVIOUS_ACTION]
         self.signs = (*signs, *[1.0] * (head.out_features - len(signs)))
 
     def forward(self, td: TensorDictBase) -> Tensor:
         """``(..., N, outputs)``."""
-        here, there = self.head(td), self.head(graph.mirrored(td))
+        views = self._views(td)
+        here, there = (self.head(view) for view in views)
+        if self.memory is not None and views[0].get(entries.NEXT_MEMORY, None) is not None:  # one step, no sequence
+            td.set(entries.NEXT_MEMORY, torch.cat([view.get(entries.NEXT_MEMORY) for view in views], dim=-1))
         return 0.5 * (here + there * graph.sign_vector(self.signs, there.device))
+
+    @property
+    def function(self) -> nn.Sequential:
+        """The head's."""
+        return self.head.function
+
+    @property
+    def memory(self) -> Memory | None:
+        """The head's."""
+        return self.head.memory
+
+    def inputs(self, td: TensorDictBase) -> Tensor:
+        """What the head reads of what is there, not of its image."""
+        return self.head.inputs(self._views(td)[0])
+
+    def _views(self, td: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        """What is there and its mirror image, with the hidden state that belongs to either."""
+        there = graph.mirrored(td, self.privileged_image)
+        if self.memory is None:
+            return td, there
+        here = td.select(*self.in_keys, strict=False)
+        there.set(entries.IS_INIT, td.get(entries.IS_INIT))
+        state = td.get(entries.MEMORY, None)
+        if state is None:
+            agents = td.get(entries.AGENT_POSITION)
+            state = agents.new_zeros(*agents.shape[:-1], 2 * self.memory.size)
+            td.set(entries.MEMORY, state)
+        for view, half in zip((here, there), state.chunk(2, dim=-1), strict=True):
+            view.set(entries.MEMORY, half)
+        return here, there
+
+
+def build_head(
+    encoder: Encoder, sizes: Sizes, config: Any, outputs: int, n_privileged: int, memory: MemoryConfig | None = None
+) -> AgentHead | Mirrored:
+    """Build an actor's head, ``outputs`` numbers an agent, from its configuration; ``n_privileged`` > 0: an oracle's.
+
+    The points among the privileged numbers are told relative to each agent too where the configuration says so.
+    """
+    points = sizes.n_points if n_privileged and config.relative_points else 0
+    head = AgentHead(encoder, config.widths, outputs, 0.01, n_privileged, points, memory, config.hidden_norm)
+    return Mirrored(head, sizes.privileged_image) if config.mirror else head
 
 
 @torch.no_grad()
@@ -243,7 +290,7 @@ def actor_saturation(policy: nn.Module, batch: TensorDictBase) -> dict[str, floa
         ``actor_saturation``, the share of units with a pre-activation beyond +- ``SATURATED``, and
         ``actor_preactivation``, the mean of its absolute value. Empty for a head without hidden layers or none at all.
     """
-    head = next((module for module in policy.modules() if isinstance(module, AgentHead)), None)
+    head = next((module for module in policy.modules() if isinstance(module, AgentHead | Mirrored)), None)
     if head is None or len(head.function) == 1:
         return {}
     count = min(batch.numel(), SATURATION_FRAMES)
@@ -259,18 +306,14 @@ def actor_saturation(policy: nn.Module, batch: TensorDictBase) -> dict[str, floa
 class GaussianPolicy(TensorDictModuleBase):
     """Writes the pre-tanh mean ``LOC`` and standard deviation ``SCALE`` of every agent's action, ``(..., N, 2)``."""
 
-    def __init__(
-        self, encoder: Encoder, actions: int, config: ActorConfig, n_privileged: int = 0, n_points: int = 0
-    ) -> None:
-        """Put the policy's head on an encoder; ``actions`` is A, the numbers in one agent's action."""
+    def __init__(self, encoder: Encoder, sizes: Sizes, config: ActorConfig, n_privileged: int = 0) -> None:
+        """Put the policy's head on an encoder."""
         super().__init__()
+        actions = sizes.action
         outputs = 2 * actions if config.state_dependent_sigma else actions
-        head = AgentHead(
-            encoder, config.widths, outputs, 0.01, n_privileged, n_points, config.memory, config.hidden_norm
-        )
-        self.in_keys = head.in_keys
-        self.out_keys = [LOC, SCALE, *([] if head.memory is None else head.memory.out_keys)]
-        self.head = Mirrored(head) if config.mirror else head
+        self.head = build_head(encoder, sizes, config, outputs, n_privileged, config.memory)
+        self.in_keys = self.head.in_keys
+        self.out_keys = [LOC, SCALE, *([] if self.head.memory is None else self.head.memory.out_keys)]
         self.persistence = config.persistence
         self.low, self.range = math.log(config.min_sigma), math.log(config.max_sigma / config.min_sigma)
         fraction = torch.tensor((math.log(config.initial_sigma) - self.low) / self.range)
@@ -334,11 +377,6 @@ class AgentValue(TensorDictModuleBase):
         return td.set(STATE_VALUE, self.head(td))
 
 
-def told_points(config: Any, sizes: Sizes, n_privileged: int) -> int:
-    """Number of points that an actor of these settings is told relative to each agent; only an oracle's is any."""
-    return sizes.n_points if n_privileged and config.relative_points else 0
-
-
 def build_actor(
     encoder_config: Any, sizes: Sizes, config: ActorConfig, n_privileged: int = 0
 ) -> ProbabilisticTensorDictSequential:
@@ -354,7 +392,7 @@ def build_actor(
     policy would not be one. Losses that need the exact pathwise sample (SAC) take it from ``get_dist``.
     """
     encoder = build_encoder(encoder_config, sizes, config.embedding_norm)
-    policy = GaussianPolicy(encoder, sizes.action, config, n_privileged, told_points(config, sizes, n_privileged))
+    policy = GaussianPolicy(encoder, sizes, config, n_privileged)
     sample = ProbabilisticTensorDictModule(
         in_keys={"loc": LOC, "scale": SCALE},
         out_keys=[entries.ACTION],

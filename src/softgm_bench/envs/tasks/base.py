@@ -155,6 +155,8 @@ class Task(ABC):
         max_cylinder_length: the longest cylinder of any scene, m; 0 where there is none.
         n_privileged: numbers in a scene's ``privileged``.
         n_points: points among them, m; the first ``3 n_points`` numbers are their coordinates.
+        privileged_image: what a mirror in the plane y = 0 makes of them: for each number of the image the index of the
+            number that is there, and the sign that it gets; only an oracle's mirrored actor needs it.
         moves: whether cylinders move, by ``advance``.
     """
 
@@ -163,6 +165,7 @@ class Task(ABC):
     max_cylinder_length: float = 0.0
     n_privileged: int = 0
     n_points: int = 0
+    privileged_image: tuple[tuple[int, float], ...] = ()
     moves: bool = False
 
     def __init__(self, config: Any) -> None:

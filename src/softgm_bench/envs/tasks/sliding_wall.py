@@ -39,6 +39,7 @@ class SlidingWall(Wall):
 
     config_class: ClassVar[type[SlidingWallConfig]] = SlidingWallConfig
     n_privileged = 5
+    privileged_image = (*Wall.privileged_image, (4, -1.0))
     moves = True
 
     def sample(self, count: int, generator: torch.Generator, difficulty: Tensor | None = None) -> Scene:

@@ -46,6 +46,8 @@ class SwingingPosts(Structured):
     config_class: ClassVar[type[SwingingPostsConfig]] = SwingingPostsConfig
     n_privileged = 8
     n_points = 2
+    # the image of the right post is the left one's
+    privileged_image = ((3, 1.0), (4, -1.0), (5, 1.0), (0, 1.0), (1, -1.0), (2, 1.0), (7, -1.0), (6, -1.0))
     moves = True
 
     def sample(self, count: int, generator: torch.Generator, difficulty: Tensor | None = None) -> Scene:

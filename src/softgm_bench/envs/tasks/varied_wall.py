@@ -83,7 +83,8 @@ class VariedWall(Wall):
             ValueError: as ``Wall``.
         """
         super().__init__(config)
-        self.n_privileged = 5 if config.wall_yaw else 4
+        if config.wall_yaw:
+            self.n_privileged, self.privileged_image = 5, (*Wall.privileged_image, (4, -1.0))
         self._cut = self.max_cylinders - len(self.column_y)
         self.closing = 0
         if config.dead_end is not None:

@@ -86,6 +86,7 @@ class Wall(Task):
     config_class: ClassVar[type[WallConfig]] = WallConfig
     n_privileged = 4
     n_points = 1
+    privileged_image: tuple[tuple[int, float], ...] = ((0, 1.0), (1, -1.0), (2, 1.0), (3, 1.0))
 
     def __init__(self, config: WallConfig) -> None:
         """Lay out the columns.
