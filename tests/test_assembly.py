@@ -66,10 +66,12 @@ def test_a_memory_needs_an_environment_that_hands_it_on(monkeypatch):
 
 
 def test_an_oracle_is_mirrored_only_where_its_task_says_what_mirrors_what_it_is_told(monkeypatch):
-    mirrored = ["task=wall", "algo=isac", "observation=oracle", "algo.actor.mirror=true"]
+    mirrored = ["task=wall", "algo=isac", "observation=oracle", "algo.actor.mirror=canonical"]
     configure(mirrored)
     monkeypatch.setattr(Wall, "privileged_image", ())
-    with pytest.raises(UserError, match=r"^algo\.actor\.mirror is true with observation=oracle: task=wall [^\n]*$"):
+    with pytest.raises(
+        UserError, match=r"^algo\.actor\.mirror is canonical with observation=oracle: task=wall [^\n]*$"
+    ):
         configure(mirrored)
 
 
@@ -77,5 +79,5 @@ def test_a_plain_vector_has_no_mirror_image():
     pytest.importorskip("vmas", reason="VMAS is an optional extra: pip install 'softgm-bench[vmas]'")
     vector = ["task=vmas_balance", "algo=ippo", "model=vector_mlp", "algo.actor.persistence=0"]
     configure(vector)
-    with pytest.raises(UserError, match=r"^algo\.actor\.mirror is true[^\n]*vector.* must be false$"):
-        configure([*vector, "algo.actor.mirror=true"])
+    with pytest.raises(UserError, match=r"^algo\.actor\.mirror is canonical[^\n]*vector.* must be null$"):
+        configure([*vector, "algo.actor.mirror=canonical"])

@@ -153,7 +153,7 @@ def _check_one(config: Config) -> None:
                 "algo.critic.mlp: it reads the arm's observation, "
                 f"which task={config.task.name} has not; it must be null"
             )
-        if getattr(getattr(config.algo, "actor", None), "mirror", False):
+        if getattr(getattr(config.algo, "actor", None), "mirror", None):
             _refuse_mirror(config, env.sizes)
         encoder = build_encoder(config.model, env.sizes)
     except ValueError as error:
@@ -169,15 +169,13 @@ def _refuse_mirror(config: Config, sizes: Sizes) -> None:
     Raises:
         ValueError: with one line naming the key, its value and what would be right.
     """
+    mirror, task = f"algo.actor.mirror is {config.algo.actor.mirror}", f"task={config.task.name}"
     if sizes.layout == VECTOR:
-        raise ValueError(
-            f"algo.actor.mirror is true: task={config.task.name} shows a plain vector, whose mirror image is unknown; "
-            "it must be false"
-        )
+        raise ValueError(f"{mirror}: {task} shows a plain vector, whose mirror image is unknown; it must be null")
     if config.oracle and len(sizes.privileged_image) != sizes.n_privileged:
         raise ValueError(
-            f"algo.actor.mirror is true with observation=oracle: task={config.task.name} does not say what mirrors "
-            "the numbers that an oracle is told (privileged_image); it must be false"
+            f"{mirror} with observation=oracle: {task} does not say what mirrors the numbers that an oracle is told "
+            "(privileged_image); it must be null"
         )
 
 

@@ -38,9 +38,9 @@ def test_targets_bootstrap_at_a_truncation_and_not_at_a_termination(build, name)
     assert losses["loss_actor"].item() == 0.0
 
 
-@pytest.mark.parametrize("name", ["iddpg", "maddpg"])
-def test_a_mirrored_policy_does_in_the_mirror_what_mirrors_its_actions(build, name):
-    algorithm, env = build(name, "algo.actor.mirror=true", task="wall")
+@pytest.mark.parametrize(("name", "mirror"), [("iddpg", "average"), ("maddpg", "canonical")])
+def test_a_mirrored_policy_does_in_the_mirror_what_mirrors_its_actions(build, name, mirror):
+    algorithm, env = build(name, f"algo.actor.mirror={mirror}", task="wall")
     with torch.no_grad():
         for parameter in algorithm.policy.parameters():
             parameter.normal_(std=0.1)

@@ -22,7 +22,8 @@ CASES = pytest.mark.parametrize(
         ("softgm", "wall", "softgm"),
         ("mappo", "structured", "mlp"),
         ("ippo", "wall", "mlp"),
-        ("softgm algo.actor.mirror=true", "wall", "softgm"),
+        ("softgm algo.actor.mirror=average", "wall", "softgm"),
+        ("softgm algo.actor.mirror=canonical", "wall", "softgm"),
         ("ippo", "vmas_balance", "vector_mlp"),
     ],
 )

@@ -32,7 +32,7 @@ def assert_holds(values, written):
 def test_the_settings_of_every_committed_run_are_read_and_none_is_changed(path):
     written = OmegaConf.load(path)
     config = typed(written)
-    assert_holds(plain(config), OmegaConf.to_container(written))
+    assert_holds(plain(config), upgraded(OmegaConf.to_container(written)))
     # A run from before these had names has none.
     assert (config.recipe, config.experiment.name) == (written.get("recipe", ""), written.experiment.get("name", ""))
     assert config.task.name in path.parts
@@ -95,3 +95,10 @@ def test_runs_from_before_there_were_perturbations_had_none():
     values = plain(compose([]))
     del values["perturbation"]
     assert typed(OmegaConf.create(values)) == compose([])
+
+
+@pytest.mark.parametrize(("written", "today"), [(False, None), (True, "average"), ("canonical", "canonical")])
+def test_a_mirror_that_was_on_or_off_is_an_average_or_none(written, today):
+    values = plain(compose(["algo=mappo", "task=wall"]))
+    values["algo"]["actor"]["mirror"] = written
+    assert typed(OmegaConf.create(values)).algo.actor.mirror == today

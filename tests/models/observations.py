@@ -120,7 +120,7 @@ def actor_config(**changes):
         "hidden_norm": False,
         "relative_points": False,
         "memory": None,
-        "mirror": False,
+        "mirror": None,
     }
     return ActorConfig(**(values | changes))
 

@@ -21,6 +21,7 @@ from softgm_bench.envs.interface import Environment, Sizes
 from softgm_bench.models.action_value import ACTION_VALUE, build_action_value
 from softgm_bench.models.heads import build_head
 from softgm_bench.models.memory import MemoryConfig
+from softgm_bench.models.mirror import check_mirror
 from softgm_bench.models.registry import Encoder, build_encoder
 
 
@@ -34,7 +35,8 @@ class DeterministicActorConfig:
         hidden_norm: what enters each tanh of the head is normalised (paper: no); see ``models.heads.feedforward``.
         relative_points: an oracle's actor is told the privileged points relative to each agent too.
         memory: None; PPO alone trains recurrent actors.
-        mirror: the action commutes with the mirror in the plane y = 0 (paper: no); see ``models.heads.Mirrored``.
+        mirror: the way in which the action commutes with the mirror in the plane y = 0, ``average`` or ``canonical``
+            (see ``models.mirror``); None: it does not (paper).
     """
 
     widths: list[int]
@@ -42,7 +44,15 @@ class DeterministicActorConfig:
     hidden_norm: bool
     relative_points: bool
     memory: MemoryConfig | None
-    mirror: bool
+    mirror: str | None
+
+    def __post_init__(self) -> None:
+        """Refuse values that give no policy.
+
+        Raises:
+            ValueError: with one line naming the key, its value and what would be right.
+        """
+        check_mirror(self.mirror)
 
 
 @dataclass

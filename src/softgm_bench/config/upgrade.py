@@ -28,7 +28,7 @@ NEUTRAL: dict[str, Any] = {
     "algo.actor.relative_points": False,
     "model.remember": False,
     "algo.actor.memory": None,
-    "algo.actor.mirror": False,
+    "algo.actor.mirror": None,
 }
 ABLATIONS = ("softgm_no_stage1", "softgm_no_stage2")  # algorithms then, models of the algorithm softgm now
 
@@ -36,7 +36,12 @@ ABLATIONS = ("softgm_no_stage1", "softgm_no_stage2")  # algorithms then, models 
 def upgraded(values: Mapping[str, Any]) -> dict[str, Any]:
     """Plain values of a configuration with today's names; those of today come back as they are."""
     algo = values.get("algo")
-    if not isinstance(algo, Mapping) or algo.get("name") not in ABLATIONS:
+    if not isinstance(algo, Mapping):
         return dict(values)
+    actor = algo.get("actor")
+    if isinstance(actor, Mapping) and isinstance(actor.get("mirror"), bool):  # there was one way to mirror
+        algo = dict(algo) | {"actor": dict(actor) | {"mirror": "average" if actor["mirror"] else None}}
+    if algo.get("name") not in ABLATIONS:
+        return dict(values) | {"algo": algo}
     model = dict(values.get("model") or {}) | {"name": algo["name"]}
     return dict(values) | {"algo": dict(algo) | {"name": "softgm"}, "model": model}

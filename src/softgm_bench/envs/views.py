@@ -26,19 +26,26 @@ MIRRORED: dict[NestedKey, tuple[float, ...]] = {
 }
 
 
-def mirrored(td: TensorDictBase, privileged_image: Sequence[tuple[int, float]] = ()) -> TensorDictBase:
+def mirrored(
+    td: TensorDictBase, privileged_image: Sequence[tuple[int, float]] = (), where: Tensor | None = None
+) -> TensorDictBase:
     """Give the observation in ``td`` as a mirror in the plane y = 0 shows it; slots stay in their places.
 
     An arm that is moved by mirrored actions among mirrored obstacles observes this, bit by bit. With a
-    ``privileged_image`` (``interface.Sizes``) the image has the privileged numbers too.
+    ``privileged_image`` (``interface.Sizes``) the image has the privileged numbers too. ``where``, bool ``(..., 1)``:
+    frames that are mirrored, if not all are; the others stay as they are.
     """
     image = td.select(*entries.OBSERVATION)
     if privileged_image:
         known, (order, signs) = td.get(entries.PRIVILEGED), zip(*privileged_image, strict=True)
-        image.set(entries.PRIVILEGED, known[..., index_vector(order, known.device)] * sign_vector(signs, known.device))
+        there = known[..., index_vector(order, known.device)] * sign_vector(signs, known.device)
+        image.set(entries.PRIVILEGED, there if where is None else torch.where(where, there, known))
     for key, signs in MIRRORED.items():
         value = image.get(key)
-        image.set(key, value * sign_vector(signs, value.device))
+        factor = sign_vector(signs, value.device)
+        if where is not None:
+            factor = torch.where(where if value.ndim == where.ndim else where.unsqueeze(-2), factor, 1.0)
+        image.set(key, value * factor)
     return image
 
 

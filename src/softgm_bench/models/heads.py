@@ -26,6 +26,7 @@ from softgm_bench.envs.interface import Sizes
 from softgm_bench.models import graph
 from softgm_bench.models.activation import Tanh
 from softgm_bench.models.memory import Memory, MemoryConfig
+from softgm_bench.models.mirror import WAYS, MirroredHead, check_mirror
 from softgm_bench.models.mlp import MLPConfig
 from softgm_bench.models.registry import Encoder, TeamEncoder, build_encoder, build_team_encoder
 from softgm_bench.upstream.squashed_normal import SquashedNormal
@@ -55,7 +56,8 @@ class ActorConfig:
         hidden_norm: what enters each tanh of the head is normalised (paper: no); see ``feedforward``.
         relative_points: an oracle's actor is told the privileged points relative to each agent too.
         memory: each agent remembers, by a recurrent cell before the head; None: it does not (paper).
-        mirror: the mean commutes with the mirror in the plane y = 0 (paper: no); see ``Mirrored``.
+        mirror: the way in which the mean commutes with the mirror in the plane y = 0, ``average`` or ``canonical`` (see
+            ``models.mirror``); None: it does not (paper).
     """
 
     widths: list[int]
@@ -69,7 +71,7 @@ class ActorConfig:
     hidden_norm: bool
     relative_points: bool
     memory: MemoryConfig | None
-    mirror: bool
+    mirror: str | None
 
     def __post_init__(self) -> None:
         """Refuse values that give no policy.
@@ -86,6 +88,7 @@ class ActorConfig:
             raise ValueError(f"algo.actor.mean_bound is {self.mean_bound}: it must be above 0")
         if not 0.0 <= self.persistence < 1.0:
             raise ValueError(f"algo.actor.persistence is {self.persistence}: it must be at least 0 and below 1")
+        check_mirror(self.mirror)
 
 
 @dataclass
@@ -205,75 +208,16 @@ class AgentHead(nn.Module):
         return own if self.memory is None else torch.cat([own, self.memory(td, own)], dim=-1)
 
 
-class Mirrored(nn.Module):
-    """A head f made to commute with the mirror in the plane y = 0: ``(f(o) + S f(M o)) / 2``.
-
-    M mirrors the observation, S what f says of actions, whose binormal part changes its sign. On every task of the arm
-    a scene is as likely as its mirror image, so there is a best policy that commutes with it. An ordinary network has
-    to learn each side by itself, and may settle on one. This one bends to neither where a scene looks the same in the
-    mirror. A head with a memory has two hidden states side by side, of what it saw and of the image of that.
-    """
-
-    def __init__(self, head: AgentHead, privileged_image: Sequence[tuple[int, float]] = ()) -> None:
-        """Mirror ``head``, whose outputs are an agent's action and, where there are more, even functions.
-
-        One that reads privileged numbers needs their ``privileged_image`` (``interface.Sizes``).
-        """
-        super().__init__()
-        self.head, self.in_keys = head, head.in_keys
-        self.privileged_image = tuple(privileged_image) if head.n_privileged else ()
-        signs = graph.MIRRORED[entries.PREVIOUS_ACTION]
-        self.signs = (*signs, *[1.0] * (head.out_features - len(signs)))
-
-    def forward(self, td: TensorDictBase) -> Tensor:
-        """``(..., N, outputs)``."""
-        views = self._views(td)
-        here, there = (self.head(view) for view in views)
-        if self.memory is not None and views[0].get(entries.NEXT_MEMORY, None) is not None:  # one step, no sequence
-            td.set(entries.NEXT_MEMORY, torch.cat([view.get(entries.NEXT_MEMORY) for view in views], dim=-1))
-        return 0.5 * (here + there * graph.sign_vector(self.signs, there.device))
-
-    @property
-    def function(self) -> nn.Sequential:
-        """The head's."""
-        return self.head.function
-
-    @property
-    def memory(self) -> Memory | None:
-        """The head's."""
-        return self.head.memory
-
-    def inputs(self, td: TensorDictBase) -> Tensor:
-        """What the head reads of what is there, not of its image."""
-        return self.head.inputs(self._views(td)[0])
-
-    def _views(self, td: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
-        """What is there and its mirror image, with the hidden state that belongs to either."""
-        there = graph.mirrored(td, self.privileged_image)
-        if self.memory is None:
-            return td, there
-        here = td.select(*self.in_keys, strict=False)
-        there.set(entries.IS_INIT, td.get(entries.IS_INIT))
-        state = td.get(entries.MEMORY, None)
-        if state is None:
-            agents = td.get(entries.AGENT_POSITION)
-            state = agents.new_zeros(*agents.shape[:-1], 2 * self.memory.size)
-            td.set(entries.MEMORY, state)
-        for view, half in zip((here, there), state.chunk(2, dim=-1), strict=True):
-            view.set(entries.MEMORY, half)
-        return here, there
-
-
 def build_head(
     encoder: Encoder, sizes: Sizes, config: Any, outputs: int, n_privileged: int, memory: MemoryConfig | None = None
-) -> AgentHead | Mirrored:
+) -> AgentHead | MirroredHead:
     """Build an actor's head, ``outputs`` numbers an agent, from its configuration; ``n_privileged`` > 0: an oracle's.
 
     The points among the privileged numbers are told relative to each agent too where the configuration says so.
     """
     points = sizes.n_points if n_privileged and config.relative_points else 0
     head = AgentHead(encoder, config.widths, outputs, 0.01, n_privileged, points, memory, config.hidden_norm)
-    return Mirrored(head, sizes.privileged_image) if config.mirror else head
+    return WAYS[config.mirror](head, sizes.privileged_image) if config.mirror else head
 
 
 @torch.no_grad()
@@ -290,7 +234,7 @@ def actor_saturation(policy: nn.Module, batch: TensorDictBase) -> dict[str, floa
         ``actor_saturation``, the share of units with a pre-activation beyond +- ``SATURATED``, and
         ``actor_preactivation``, the mean of its absolute value. Empty for a head without hidden layers or none at all.
     """
-    head = next((module for module in policy.modules() if isinstance(module, AgentHead | Mirrored)), None)
+    head = next((module for module in policy.modules() if isinstance(module, AgentHead | MirroredHead)), None)
     if head is None or len(head.function) == 1:
         return {}
     count = min(batch.numel(), SATURATION_FRAMES)

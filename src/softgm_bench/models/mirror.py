@@ -1,0 +1,137 @@
+"""Heads of actors that commute with the mirror in the plane y = 0.
+
+M mirrors the observation, S what a head f says of actions, whose binormal part changes its sign. On every task of the
+arm a scene is as likely as its mirror image, so there is a best policy g with ``g(M o) = S g(o)``. An ordinary network
+has to learn each side by itself, and may settle on one. There are two ways to have it so for any f:
+
+- ``average``: ``g(o) = (f(o) + S f(M o)) / 2``, at the price of two passes of the network. It bends to neither side
+  where both look the same. (Frame averaging over the whole group, Puny et al. 2022.)
+- ``canonical``: f only ever sees targets on the arm's left (y >= 0): ``g(o) = f(o)`` there and ``S f(M o)`` where the
+  target is on the right. One pass. (Canonicalisation, Kaba et al. 2023.)
+"""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+
+from softgm_bench.envs import entries
+from softgm_bench.models import graph
+
+if TYPE_CHECKING:
+    from softgm_bench.models.heads import AgentHead
+    from softgm_bench.models.memory import Memory
+
+AVERAGE, CANONICAL = "average", "canonical"
+
+
+def check_mirror(mirror: str | None) -> None:
+    """Refuse what is no way to mirror.
+
+    Raises:
+        ValueError: with one line naming the key, its value and what would be right.
+    """
+    if mirror not in (None, AVERAGE, CANONICAL):
+        raise ValueError(f"algo.actor.mirror is {mirror}: choose {AVERAGE}, {CANONICAL} or null")
+
+
+class MirroredHead(nn.Module):
+    """What both ways share; subclasses say what the head sees and what becomes of its answers.
+
+    Attributes:
+        head: f.
+        in_keys: the entries that are read.
+        states: hidden states that an agent has side by side, if f has a memory.
+    """
+
+    states = 1
+
+    def __init__(self, head: "AgentHead", privileged_image: Sequence[tuple[int, float]] = ()) -> None:
+        """Mirror ``head``, whose outputs are an agent's action and, where there are more, even functions.
+
+        One that reads privileged numbers needs their ``privileged_image`` (``interface.Sizes``).
+        """
+        super().__init__()
+        self.head, self.in_keys = head, head.in_keys
+        self.privileged_image = tuple(privileged_image) if head.n_privileged else ()
+        signs = graph.MIRRORED[entries.PREVIOUS_ACTION]
+        self.signs = (*signs, *[1.0] * (head.out_features - len(signs)))
+
+    @property
+    def function(self) -> nn.Sequential:
+        """The head's."""
+        return self.head.function
+
+    @property
+    def memory(self) -> "Memory | None":
+        """The head's."""
+        return self.head.memory
+
+    def inputs(self, td: TensorDictBase) -> Tensor:
+        """What the head reads of what is there; an average's of its image would come second."""
+        return self.head.inputs(self.views(td)[0])
+
+    def views(self, td: TensorDictBase) -> list[TensorDictBase]:
+        """What the head sees, once or more often, each with the hidden state that belongs to it."""
+        views = self.sights(td)
+        if self.memory is None:
+            return views
+        state = td.get(entries.MEMORY, None)
+        if state is None:
+            agents = td.get(entries.AGENT_POSITION)
+            state = agents.new_zeros(*agents.shape[:-1], self.states * self.memory.size)
+            td.set(entries.MEMORY, state)
+        for view, part in zip(views, state.chunk(self.states, dim=-1), strict=True):
+            view.set(entries.IS_INIT, td.get(entries.IS_INIT)).set(entries.MEMORY, part)
+        return views
+
+    def sights(self, td: TensorDictBase) -> list[TensorDictBase]:
+        """Observations that the head sees, in tensordicts that may be written to."""
+        raise NotImplementedError
+
+    def answers(self, td: TensorDictBase) -> list[Tensor]:
+        """The head's, ``(..., N, outputs)`` for each view; what it remembers of one step is written to ``td``."""
+        views = self.views(td)
+        answers = [self.head(view) for view in views]
+        states = [view.get(entries.NEXT_MEMORY, None) for view in views]
+        if states[0] is not None:  # of a sequence of steps there is none
+            td.set(entries.NEXT_MEMORY, torch.cat(states, dim=-1))
+        return answers
+
+
+class Averaged(MirroredHead):
+    """``(f(o) + S f(M o)) / 2``. With a memory there are two hidden states, of what is there and of its image."""
+
+    states = 2
+
+    def forward(self, td: TensorDictBase) -> Tensor:
+        """``(..., N, outputs)``."""
+        here, there = self.answers(td)
+        return 0.5 * (here + there * graph.sign_vector(self.signs, there.device))
+
+    def sights(self, td: TensorDictBase) -> list[TensorDictBase]:
+        """What is there, and its image."""
+        return [td.select(*self.in_keys, strict=False), graph.mirrored(td, self.privileged_image)]
+
+
+class Canonical(MirroredHead):
+    """``f(o)`` where the target is on the left, ``S f(M o)`` where it is on the right."""
+
+    def forward(self, td: TensorDictBase) -> Tensor:
+        """``(..., N, outputs)``."""
+        (answer,) = self.answers(td)
+        turned = self._turned(td).unsqueeze(-2)
+        return torch.where(turned, answer * graph.sign_vector(self.signs, answer.device), answer)
+
+    def sights(self, td: TensorDictBase) -> list[TensorDictBase]:
+        """What is there, or its image where the target is on the right."""
+        return [graph.mirrored(td, self.privileged_image, where=self._turned(td))]
+
+    def _turned(self, td: TensorDictBase) -> Tensor:
+        """Where the target is on the right, ``(..., 1)``."""
+        return td.get(entries.TARGET)[..., 1:2] < 0.0
+
+
+WAYS: dict[str, type[MirroredHead]] = {AVERAGE: Averaged, CANONICAL: Canonical}
