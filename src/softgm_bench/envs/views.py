@@ -4,13 +4,13 @@ Shapes: ``...`` are any leading batch dimensions (time, environment), N agents, 
 """
 
 from collections.abc import Sequence
-from functools import lru_cache
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from softgm_bench.envs import entries
+from softgm_bench.rod.sync import constant
 
 CHANNELS = 15  # of an agent or a slot, without the paper's reserved zeros
 
@@ -38,7 +38,7 @@ def mirrored(
     image = td.select(*entries.OBSERVATION)
     if privileged_image:
         known, (order, signs) = td.get(entries.PRIVILEGED), zip(*privileged_image, strict=True)
-        there = known[..., index_vector(order, known.device)] * sign_vector(signs, known.device)
+        there = known[..., constant(order, known.device, torch.int64)] * sign_vector(signs, known.device)
         image.set(entries.PRIVILEGED, there if where is None else torch.where(where, there, known))
     for key, signs in MIRRORED.items():
         value = image.get(key)
@@ -49,16 +49,9 @@ def mirrored(
     return image
 
 
-@lru_cache
-def index_vector(indices: tuple[int, ...], device: torch.device) -> Tensor:
-    """Indices as int64, copied to the device once; not to be changed."""
-    return torch.tensor(indices, device=device)
-
-
-@lru_cache
 def sign_vector(signs: tuple[float, ...], device: torch.device) -> Tensor:
     """Signs as float32, copied to the device once; not to be changed."""
-    return torch.tensor(signs, device=device)
+    return constant(signs, device, torch.float32)
 
 
 def agent_channels(td: TensorDictBase, velocity_scale: float = 1.0) -> Tensor:

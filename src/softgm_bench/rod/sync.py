@@ -42,6 +42,12 @@ def _numba_reaches_gpus() -> bool:
     return bool(cuda.is_available())
 
 
+@lru_cache
+def constant(values: tuple, device: torch.device, dtype: torch.dtype = torch.float64) -> Tensor:
+    """Nested tuples of numbers as a tensor that is copied to the device once; not to be changed."""
+    return torch.tensor(values, dtype=dtype, device=device)
+
+
 def any_true(mask: Tensor) -> bool:
     """Tell whether any entry of a bool tensor is true; True without reading it where that would have to wait."""
     return not is_free(mask.device) or bool(mask.any())

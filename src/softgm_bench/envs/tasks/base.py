@@ -13,6 +13,7 @@ from torch import Tensor
 from softgm_bench.envs.section_mixture import check_numbers
 from softgm_bench.rod import sync
 from softgm_bench.rod.state import Cylinders
+from softgm_bench.rod.sync import constant
 
 POOL = 4096  # fewest values among which admissible ones are looked for where nobody may count them
 
@@ -230,12 +231,6 @@ def uniform_box(count: int, bounds: Sequence[Bounds] | Tensor, generator: torch.
     low, high = bounds.unsqueeze(-1).unbind(1)
     noise = torch.rand((len(bounds), count), generator=generator, device=generator.device, dtype=torch.float64)
     return (low + (high - low) * noise).mT.contiguous()
-
-
-@lru_cache
-def constant(values: tuple, device: torch.device) -> Tensor:
-    """Nested tuples of numbers as a float64 tensor that is copied to the device once; not to be changed."""
-    return torch.tensor(values, dtype=torch.float64, device=device)
 
 
 def redraw_until(

@@ -12,13 +12,13 @@ from softgm_bench.envs.tasks.base import (
     Scene,
     Task,
     TaskConfig,
-    constant,
     eased,
     no_cylinders,
     redraw_until,
     uniform,
 )
 from softgm_bench.envs.tasks.registry import register_task
+from softgm_bench.rod.sync import constant
 
 
 @dataclass

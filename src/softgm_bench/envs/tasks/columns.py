@@ -5,8 +5,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from softgm_bench.envs.tasks.base import Range, constant
+from softgm_bench.envs.tasks.base import Range
 from softgm_bench.rod.state import Cylinders
+from softgm_bench.rod.sync import constant
 
 
 def columns(

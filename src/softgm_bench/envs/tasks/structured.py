@@ -11,12 +11,12 @@ from softgm_bench.envs.tasks.base import (
     Scene,
     Task,
     TaskConfig,
-    constant,
     eased,
     uniform_box,
     upright_cylinders,
 )
 from softgm_bench.envs.tasks.registry import register_task
+from softgm_bench.rod.sync import constant
 
 
 @dataclass

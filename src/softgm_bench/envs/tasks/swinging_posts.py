@@ -7,9 +7,10 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from softgm_bench.envs.tasks.base import Scene, constant, uniform_box
+from softgm_bench.envs.tasks.base import Scene, uniform_box
 from softgm_bench.envs.tasks.registry import register_task
 from softgm_bench.envs.tasks.structured import Structured, StructuredConfig
+from softgm_bench.rod.sync import constant
 
 
 @dataclass

@@ -7,11 +7,12 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from softgm_bench.envs.tasks.base import Scene, constant, redraw_until, uniform_box
+from softgm_bench.envs.tasks.base import Scene, redraw_until, uniform_box
 from softgm_bench.envs.tasks.columns import columns
 from softgm_bench.envs.tasks.registry import register_task
 from softgm_bench.envs.tasks.wall import Wall, WallConfig
 from softgm_bench.rod.state import Cylinders
+from softgm_bench.rod.sync import constant
 
 
 @dataclass

@@ -13,13 +13,13 @@ from softgm_bench.envs.tasks.base import (
     Scene,
     Task,
     TaskConfig,
-    constant,
     redraw_until,
     uniform_box,
 )
 from softgm_bench.envs.tasks.columns import columns
 from softgm_bench.envs.tasks.registry import register_task
 from softgm_bench.rod.state import Cylinders
+from softgm_bench.rod.sync import constant
 
 
 @dataclass
