@@ -134,4 +134,13 @@ class Canonical(MirroredHead):
         return td.get(entries.TARGET)[..., 1:2] < 0.0
 
 
+def seen(policy: nn.Module, td: TensorDictBase) -> TensorDictBase:
+    """What a policy's network is asked about in these frames: the frames themselves, or of some a mirror image.
+
+    An average asks about every frame and its image; the frames are given.
+    """
+    head = next((module for module in policy.modules() if isinstance(module, MirroredHead)), None)
+    return td if head is None else head.sights(td)[0]
+
+
 WAYS: dict[str, type[MirroredHead]] = {AVERAGE: Averaged, CANONICAL: Canonical}
