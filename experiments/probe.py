@@ -4,7 +4,8 @@ Kept policies play episodes of their own walls. After a few control steps, the o
 agents have, by ridge regression over episodes: fitted to four fifths of them, tried on the last fifth, five times over.
 What is read is the mean of the team's embeddings g_i and that of their last section's alone; against these stand the
 agents' own nodes o_i, which say where the arm is and thereby already something about the opening, and the embeddings
-that the same encoder makes of the same frames without any obstacle in sight. Figures go to
+that the same encoder makes of the same frames without any obstacle in sight. Where a policy is asked about the mirror
+image of a frame, frame and opening are those of the image. Figures go to
 ``experiments/probes/<task>_<label>.json``; what lies there is not played again. Then the table in ``docs/results.md``
 between ``<!-- probes -->`` and ``<!-- end -->`` is made of them.
 """
@@ -23,6 +24,7 @@ from softgm_bench.envs import entries
 from softgm_bench.episodes.interventions import blind
 from softgm_bench.episodes.policy import TrainedPolicy, fingerprint, load
 from softgm_bench.errors import UserError
+from softgm_bench.models.mirror import seen
 from softgm_bench.models.registry import Encoder
 from softgm_bench.runs.machine import set_threads
 
@@ -95,8 +97,9 @@ def play(trained: TrainedPolicy) -> list[dict[str, float]]:
     rows = []
     for step in STEPS:
         frame = frames[~ended[:, step - 1], step]
-        place = frame[entries.PRIVILEGED][:, 1:3].double()
-        shares = {name: explained(value, place) for name, value in features(trained, frame).items()}
+        shown, place = seen(trained.policy, frame), frame[entries.PRIVILEGED][:, 1:3].double()
+        place[shown[entries.TARGET][:, 1] != frame[entries.TARGET][:, 1], 0] *= -1.0
+        shares = {name: explained(value, place) for name, value in features(trained, shown).items()}
         rows.append({"step": step, "episodes": len(frame)} | shares)
     return rows
 
