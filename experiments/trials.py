@@ -24,6 +24,7 @@ SMALL_STEPS = {
     "the recipe, seed 1": "campaign/wall/softgm/seed1",
     "the recipe, `hidden_norm`": "trials/wall/tuned_hidden-norm",
     "the recipe, `gae_lambda=0.95`": "trials/wall/tuned_lambda-0.95",
+    "the recipe, `mirror=canonical`": "trials/wall/tuned_mirror-canonical",
 }
 MLPS = {
     "SoftGM's recipe": "trials/wall/mappo_small-steps",
