@@ -75,6 +75,18 @@ def test_perturbed_and_nominal_episodes_are_of_one_policy_and_differ_in_the_pert
         assert (played[0]["horizon"], played[0]["intervention"]) == (2000, "none")
 
 
+def test_what_perturbations_are_said_to_cost_is_what_the_committed_episodes_hold(campaign):
+    page, told = " ".join(campaign.PAGE.read_text().split()), []
+    for algorithm in ("softgm", "mappo"):
+        folder = campaign.CAMPAIGN / "wall" / algorithm / "seed0" / "robustness"
+        rates = [
+            json.loads((folder / name / "summary.json").read_text())["metrics"]["success_rate"]["mean"]
+            for name in campaign.CONDITIONS.values()
+        ]
+        told.append("{:.0f}, {:.0f} and {:.0f}".format(*(100.0 * (rates[0] - rate) + 1e-9 for rate in rates[1:])))
+    assert "cost SoftGM {}, MAPPO {}**".format(*told).replace("-0", "0") in page
+
+
 def test_the_cells_of_a_task_have_equal_budgets_whatever_the_algorithm(campaign):
     for run in campaign.runs().values():
         settings = campaign.asked(run.final.task)
