@@ -64,18 +64,20 @@ SENSING = {  # rows of the page: folders
     "SoftGM, seed 1, `promote=0.75`": "trials/wall_sense/seed1_promote-0.75",
     "SoftGM, seed 0, `easier_share=0.5`": "trials/wall_sense/seed0_share-0.5",
     "SoftGM, seed 1, `easier_share=0.5`": "trials/wall_sense/seed1_share-0.5",
-    "SoftGM, seed 0, `mirror`": "trials/wall_sense/seed0_mirror",
-    "SoftGM, seed 1, `mirror`": "trials/wall_sense/seed1_mirror",
+    "SoftGM, seed 0, `mirror=average`": "trials/wall_sense/seed0_average",
+    "SoftGM, seed 1, `mirror=average`": "trials/wall_sense/seed1_average",
+    "SoftGM without stage 1, seed 0, `mirror=average`": "trials/wall_sense/blind0_average",
+    "SoftGM, seed 0, `mirror=canonical`": "trials/wall_sense/seed0_canonical",
 }
 
 
 @pytest.mark.parametrize("name", SENSING)
-def test_the_curves_of_the_choice_that_has_to_be_sensed_are_those_of_the_committed_runs(name, results):
-    page = results.PAGE.read_text().partition("### A choice that has to be sensed")[2].partition("\n### ")[0]
+def test_the_curves_of_the_choice_between_two_openings_are_those_of_the_committed_runs(name, results):
+    page = results.PAGE.read_text().partition("### A choice between two openings")[2].partition("\n### ")[0]
     assert row_of(page, name) == reached(ROOT / "experiments" / SENSING[name])
 
 
-def test_what_is_said_of_the_choice_that_has_to_be_sensed_is_what_the_committed_runs_hold(results):
+def test_what_is_said_of_the_choice_between_two_openings_is_what_the_committed_runs_hold(results):
     page = " ".join(results.PAGE.read_text().split())
     folders = [ROOT / "experiments" / folder for folder in list(SENSING.values())[:3]]
     finals = [json.loads((folder / "summary.json").read_text())["final_evaluation"] for folder in folders]
@@ -131,13 +133,47 @@ def test_easier_scenes_were_stopped_when_the_page_says(results):
 
 def test_what_is_said_of_the_mirror_is_what_its_trials_hold(results):
     curve = script(ROOT / "experiments" / "trials.py").curve
-    names = ("SoftGM, seed 0, `mirror`", "SoftGM, seed 1, `mirror`", "SoftGM, seed 0", "SoftGM, seed 1")
+    names = ("SoftGM, seed 0, `mirror=average`", "SoftGM, seed 1, `mirror=average`", "SoftGM, seed 0", "SoftGM, seed 1")
     half = [f"{curve(ROOT / 'experiments' / SENSING[name])[2]:.2f}" for name in names]
     page = " ".join(results.PAGE.read_text().split())
     assert "succeed in {} and {} of the scenes, without it in {} and {}.".format(*half) in page
     after = [f"{curve(ROOT / 'experiments' / SENSING[name])[number]:.2f}" for number in (6, 4) for name in names[:2]]
     told = "seed 0 succeeds in {} of 256 scenes and seed 1, which never chooses without the mirror, in {} after 1.5 "
     assert (told + "million frames; at a million it was {} and {}.").format(*after) in page
+    seed0, seed1, blind, canonical = (ROOT / "experiments" / "trials" / "wall_sense" / name for name in MIRRORED)
+    with (seed0 / "metrics.csv").open() as file:
+        frames = int(list(csv.DictReader(file))[-1]["frames"]) / 1e6
+    assert f"stopped by the clock after {frames:.2f} million frames ({curve(seed0)[8]:.2f} after 2 million)" in page
+    final = json.loads((seed1 / "summary.json").read_text())["final_evaluation"]
+    assert "ended at {mean:.3f} [{low:.3f}, {high:.3f}] of 1000 scenes".format(**final["success_rate"]) in page
+    played = {shown: found["success"].mean() for shown, found in results.episodes_in(seed1 / "evaluations").items()}
+    told = "it has {none:.3f}, when shown no obstacle {blind:.3f}, when shown another scene's {swap_obstacles:.3f}:"
+    assert told.format(**played) in page
+    told = "{:.2f} of 256 scenes after 1.25 million frames and {:.2f} after 1.5 million, where without the mirror it"
+    assert told.format(curve(blind)[5], curve(blind)[6]) in page
+    alone = results.episodes_in(blind / "evaluations")["none"]["success"].mean()
+    assert f"it succeeds in {alone:.3f} of the 500 scenes. Nor" in page
+    told = "chooses too ({mean:.3f}), but so does one that senses nothing ({alone:.3f} after half"
+    told = told.format(**final["success_rate"], alone=alone)
+    assert told in " ".join((ROOT / "README.md").read_text().split())
+    assert f"a million frames ({curve(canonical)[4]:.2f} of 256 scenes)" in page
+    assert f"it was stopped at {curve(canonical)[8]:.2f} after" in page
+
+
+MIRRORED = ("seed0_average", "seed1_average", "blind0_average", "seed0_canonical")
+FELT = {  # rows of the page: the evaluation whose contact each counts
+    "SoftGM, seed 0, 3 M frames": "campaign/wall_sense/softgm/seed0",
+    "SoftGM, seed 1, `mirror=average`, 3 M frames": "trials/wall_sense/seed1_average",
+    "SoftGM without stage 1, seed 0, `mirror=average`, 1.53 M frames": "trials/wall_sense/blind0_average",
+}
+
+
+@pytest.mark.parametrize("name", FELT)
+def test_how_often_a_wall_is_touched_on_the_way_is_what_the_committed_episodes_hold(name, results):
+    with (ROOT / "experiments" / FELT[name] / "evaluations" / "none" / "episodes.csv").open() as file:
+        episodes = list(csv.DictReader(file))
+    touched = np.array([int(row["contact_steps"]) if row["success"] == "True" else np.inf for row in episodes])
+    assert row_of(results.PAGE.read_text(), name) == [f"{(touched <= steps).mean():.2f}" for steps in range(6)]
 
 
 def test_the_table_of_sides_is_that_of_the_committed_figures_of_the_kept_policies():
