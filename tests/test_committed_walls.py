@@ -29,6 +29,19 @@ def row_of(page, name):
     return [cell.strip() for cell in re.search(rf"^\| {re.escape(name)} \|(.*)\|$", page, re.MULTILINE)[1].split("|")]
 
 
+def touching(folder):
+    """Control steps in contact of each episode of an evaluation, infinitely many where it failed."""
+    with (folder / "episodes.csv").open() as file:
+        episodes = list(csv.DictReader(file))
+    return np.array([int(row["contact_steps"]) if row["success"] == "True" else np.inf for row in episodes])
+
+
+def millions(folder):
+    """Frames of a training, as the page tells them."""
+    with (folder / "metrics.csv").open() as file:
+        return f"{int(list(csv.DictReader(file))[-1]['frames']) / 1e6:.2f}"
+
+
 def by_side(success):
     """Success in the certified scenes of `wall_sense` whose open opening is on the arm's left, and in the others."""
     left = certified.of_task("wall_sense").privileged[:, 1] > 0.0
@@ -49,9 +62,7 @@ def test_what_is_said_of_bumping_is_what_the_committed_curves_and_episodes_hold(
         [cell.strip() for cell in row.split("|")[2:-1]] for row in re.findall(rf"^\| {name}(?: \||,).*", page, re.M)
     )
     assert curve == reached(ROOT / "experiments" / run)
-    with (ROOT / "experiments" / run / evaluation / "episodes.csv").open() as file:
-        episodes = list(csv.DictReader(file))
-    touched = np.array([int(row["contact_steps"]) if row["success"] == "True" else np.inf for row in episodes])
+    touched = touching(ROOT / "experiments" / run / evaluation)
     assert contact == [f"{(touched <= steps).mean():.2f}" for steps in (0, 1, 2, 3, 5, 10)]
 
 
@@ -122,28 +133,27 @@ def test_what_is_said_of_a_curriculum_that_goes_back_is_what_its_trial_holds(res
 
 
 def test_easier_scenes_were_stopped_when_the_page_says(results):
-    frames = []
-    for seed in (0, 1):
-        folder = ROOT / "experiments" / SENSING[f"SoftGM, seed {seed}, `easier_share=0.5`"]
-        with (folder / "metrics.csv").open() as file:
-            frames.append(int(list(csv.DictReader(file))[-1]["frames"]) / 1e6)
-    told = "stopped after {:.2f} and {:.2f} million frames): a target".format(*frames)
+    names = (f"SoftGM, seed {seed}, `easier_share=0.5`" for seed in (0, 1))
+    frames = [millions(ROOT / "experiments" / SENSING[name]) for name in names]
+    told = "stopped after {} and {} million frames): a target".format(*frames)
     assert told in " ".join(results.PAGE.read_text().split())
 
 
 def test_what_is_said_of_the_mirror_is_what_its_trials_hold(results):
     curve = script(ROOT / "experiments" / "trials.py").curve
-    names = ("SoftGM, seed 0, `mirror=average`", "SoftGM, seed 1, `mirror=average`", "SoftGM, seed 0", "SoftGM, seed 1")
-    half = [f"{curve(ROOT / 'experiments' / SENSING[name])[2]:.2f}" for name in names]
+    trained = {name: ROOT / "experiments" / folder for name, folder in SENSING.items()}
+    seed0, seed1 = (trained[f"SoftGM, seed {seed}, `mirror=average`"] for seed in (0, 1))
+    blind = trained["SoftGM without stage 1, seed 0, `mirror=average`"]
+    canonical = trained["SoftGM, seed 0, `mirror=canonical`"]
+    without = (trained["SoftGM, seed 0"], trained["SoftGM, seed 1"])
+    half = [f"{curve(folder)[2]:.2f}" for folder in (seed0, seed1, *without)]
     page = " ".join(results.PAGE.read_text().split())
     assert "succeed in {} and {} of the scenes, without it in {} and {}.".format(*half) in page
-    after = [f"{curve(ROOT / 'experiments' / SENSING[name])[number]:.2f}" for number in (6, 4) for name in names[:2]]
+    after = [f"{curve(folder)[number]:.2f}" for number in (6, 4) for folder in (seed0, seed1)]
     told = "seed 0 succeeds in {} of 256 scenes and seed 1, which never chooses without the mirror, in {} after 1.5 "
     assert (told + "million frames; at a million it was {} and {}.").format(*after) in page
-    seed0, seed1, blind, canonical = (ROOT / "experiments" / "trials" / "wall_sense" / name for name in MIRRORED)
-    with (seed0 / "metrics.csv").open() as file:
-        frames = int(list(csv.DictReader(file))[-1]["frames"]) / 1e6
-    assert f"stopped by the clock after {frames:.2f} million frames ({curve(seed0)[8]:.2f} after 2 million)" in page
+    told = f"stopped by the clock after {millions(seed0)} million frames ({curve(seed0)[8]:.2f} after 2 million)"
+    assert told in page
     final = json.loads((seed1 / "summary.json").read_text())["final_evaluation"]
     assert "ended at {mean:.3f} [{low:.3f}, {high:.3f}] of 1000 scenes".format(**final["success_rate"]) in page
     played = {shown: found["success"].mean() for shown, found in results.episodes_in(seed1 / "evaluations").items()}
@@ -152,15 +162,14 @@ def test_what_is_said_of_the_mirror_is_what_its_trials_hold(results):
     told = "{:.2f} of 256 scenes after 1.25 million frames and {:.2f} after 1.5 million, where without the mirror it"
     assert told.format(curve(blind)[5], curve(blind)[6]) in page
     alone = results.episodes_in(blind / "evaluations")["none"]["success"].mean()
-    assert f"it succeeds in {alone:.3f} of the 500 scenes. Nor" in page
+    assert f"As it was after {millions(blind)} million frames it succeeds in {alone:.3f} of the 500 scenes. Nor" in page
     told = "chooses too ({mean:.3f}), but so does one that senses nothing ({alone:.3f} after half"
     told = told.format(**final["success_rate"], alone=alone)
     assert told in " ".join((ROOT / "README.md").read_text().split())
     assert f"a million frames ({curve(canonical)[4]:.2f} of 256 scenes)" in page
-    assert f"it was stopped at {curve(canonical)[8]:.2f} after" in page
+    assert f"it was stopped at {curve(canonical)[8]:.2f} after {millions(canonical)} million." in page
 
 
-MIRRORED = ("seed0_average", "seed1_average", "blind0_average", "seed0_canonical")
 FELT = {  # rows of the page: the evaluation whose contact each counts
     "SoftGM, seed 0, 3 M frames": "campaign/wall_sense/softgm/seed0",
     "SoftGM, seed 1, `mirror=average`, 3 M frames": "trials/wall_sense/seed1_average",
@@ -170,9 +179,7 @@ FELT = {  # rows of the page: the evaluation whose contact each counts
 
 @pytest.mark.parametrize("name", FELT)
 def test_how_often_a_wall_is_touched_on_the_way_is_what_the_committed_episodes_hold(name, results):
-    with (ROOT / "experiments" / FELT[name] / "evaluations" / "none" / "episodes.csv").open() as file:
-        episodes = list(csv.DictReader(file))
-    touched = np.array([int(row["contact_steps"]) if row["success"] == "True" else np.inf for row in episodes])
+    touched = touching(ROOT / "experiments" / FELT[name] / "evaluations" / "none")
     assert row_of(results.PAGE.read_text(), name) == [f"{(touched <= steps).mean():.2f}" for steps in range(6)]
 
 

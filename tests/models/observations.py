@@ -1,12 +1,13 @@
 """Random observations and small configurations that the tests of this folder share."""
 
+import pytest
 import torch
 from hypothesis import strategies
 from tensordict import TensorDict
 
 from softgm_bench.envs import entries
 from softgm_bench.envs.interface import Sizes
-from softgm_bench.models import ActorConfig, SoftGMConfig, ValueConfig
+from softgm_bench.models import ActorConfig, MLPConfig, SoftGMConfig, ValueConfig, build_actor
 from softgm_bench.models.informarl import InforMARLConfig
 from softgm_bench.models.section_transformer import SectionTransformerConfig
 
@@ -123,6 +124,16 @@ def actor_config(**changes):
         "mirror": None,
     }
     return ActorConfig(**(values | changes))
+
+
+ENCODERS = pytest.mark.parametrize(
+    "encoder", [softgm_config(), MLPConfig(hidden=8, layers=2, velocity_scale=1.0)], ids=["softgm", "mlp"]
+)
+
+
+def actor(encoder=None, seed=0, **changes):
+    torch.manual_seed(seed)
+    return build_actor(encoder or softgm_config(), SIZES, actor_config(**changes))
 
 
 def value_config(**changes):

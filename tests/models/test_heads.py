@@ -3,7 +3,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from observations import SIZES, actor_config, observation, randomise, softgm_config, value_config
+from observations import ENCODERS, SIZES, actor, actor_config, observation, randomise, softgm_config, value_config
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from softgm_bench.envs import entries
@@ -11,15 +11,6 @@ from softgm_bench.models import MLPConfig, MLPEncoder, build_actor, build_value,
 from softgm_bench.models.heads import LOC, POOLINGS, SATURATION_FRAMES, SCALE, STATE_VALUE, actor_saturation
 from softgm_bench.models.mlp import MLPTeamEncoder
 from softgm_bench.models.registry import Normalised, NormalisedTeam
-
-ENCODERS = pytest.mark.parametrize(
-    "encoder", [softgm_config(), MLPConfig(hidden=8, layers=2, velocity_scale=1.0)], ids=["softgm", "mlp"]
-)
-
-
-def actor(encoder=None, seed=0, **changes):
-    torch.manual_seed(seed)
-    return build_actor(encoder or softgm_config(), SIZES, actor_config(**changes))
 
 
 @ENCODERS

@@ -4,24 +4,16 @@ from dataclasses import replace
 
 import pytest
 import torch
-from observations import SIZES, actor_config, observation, randomise, softgm_config
+from observations import ENCODERS, SIZES, actor, actor_config, observation, randomise, softgm_config
 
 from softgm_bench.envs import entries
-from softgm_bench.models import MLPConfig, build_actor, graph
+from softgm_bench.models import build_actor, graph
 from softgm_bench.models.heads import LOC, SCALE, actor_saturation
 from softgm_bench.models.memory import MemoryConfig
 from softgm_bench.models.mirror import AVERAGE, CANONICAL, seen
 
-ENCODERS = pytest.mark.parametrize(
-    "encoder", [softgm_config(), MLPConfig(hidden=8, layers=2, velocity_scale=1.0)], ids=["softgm", "mlp"]
-)
 BINORMAL = torch.tensor([1.0, -1.0])  # what bends the arm sideways
 WAYS = pytest.mark.parametrize("mirror", [AVERAGE, CANONICAL])
-
-
-def actor(encoder=None, seed=0, **changes):
-    torch.manual_seed(seed)
-    return build_actor(encoder or softgm_config(), SIZES, actor_config(**changes))
 
 
 @ENCODERS

@@ -38,20 +38,15 @@ def mirrored(
     image = td.select(*entries.OBSERVATION)
     if privileged_image:
         known, (order, signs) = td.get(entries.PRIVILEGED), zip(*privileged_image, strict=True)
-        there = known[..., constant(order, known.device, torch.int64)] * sign_vector(signs, known.device)
+        there = known[..., constant(order, known.device, torch.int64)] * constant(signs, known.device, torch.float32)
         image.set(entries.PRIVILEGED, there if where is None else torch.where(where, there, known))
     for key, signs in MIRRORED.items():
         value = image.get(key)
-        factor = sign_vector(signs, value.device)
+        factor = constant(signs, value.device, torch.float32)
         if where is not None:
             factor = torch.where(where if value.ndim == where.ndim else where.unsqueeze(-2), factor, 1.0)
         image.set(key, value * factor)
     return image
-
-
-def sign_vector(signs: tuple[float, ...], device: torch.device) -> Tensor:
-    """Signs as float32, copied to the device once; not to be changed."""
-    return constant(signs, device, torch.float32)
 
 
 def agent_channels(td: TensorDictBase, velocity_scale: float = 1.0) -> Tensor:

@@ -67,7 +67,7 @@ def record(
     with torch.random.fork_rng([]), torch.no_grad(), set_exploration_type(exploration):
         env.set_seed(own)
         torch.manual_seed(own)
-        recorder = _play(trained.policy, env, episode, attention, watch)
+        recorder = _play(trained.policy, env, episode, attention_encoder(trained.policy) if attention else None, watch)
     info = {
         "label": trained.label,
         "task": config.task.name,
@@ -156,12 +156,9 @@ class _Recorder:
         self.success = bool(self._own(after[entries.SUCCESS])[0])
         self.diverged = bool(self._own(after[entries.DIVERGED])[0])
 
-    def attend(self, policy: nn.Module, data: TensorDictBase) -> None:
-        """Note the attention weights with which the next actions are chosen, if the policy has any."""
-        encoder = attention_encoder(policy)
-        if encoder is None:
-            return
-        _, weights = encoder.forward_with_attention(seen(policy, data[self.row : self.row + 1]))
+    def attend(self, encoder: Any, frame: TensorDictBase) -> None:
+        """Note the attention weights with which the next actions are chosen; ``frame`` ``(1,)``, the arm's own."""
+        _, weights = encoder.forward_with_attention(frame)
         for stage, values in weights.items():
             self.attention.setdefault(stage, []).append(values[0].numpy(force=True))
 
@@ -188,15 +185,17 @@ class _Recorder:
         return values[self.row].numpy(force=True).copy()
 
 
-def _play(module: nn.Module, env: SoftArmEnv, row: int, attention: bool, watch: Callable[[], None] | None) -> _Recorder:
+def _play(
+    module: nn.Module, env: SoftArmEnv, row: int, encoder: Any | None, watch: Callable[[], None] | None
+) -> _Recorder:
     """One episode in every environment, as ``evaluation.evaluate`` has it, until that of ``row`` ends."""
     recorder = _Recorder(env, row)
     data = env.reset()
     alive = torch.ones(env.batch_size, dtype=torch.bool)
     recorder.state(data)
     while alive[row]:
-        if attention:
-            recorder.attend(module, data)
+        if encoder is not None:
+            recorder.attend(encoder, seen(module, data[row : row + 1]))
         data = env.step(act(module, data, alive))
         alive = alive & ~data["next", entries.DONE].squeeze(-1)
         recorder.step(data["next"])

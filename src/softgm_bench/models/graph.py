@@ -22,7 +22,6 @@ from softgm_bench.envs.views import (
     mirrored,
     obstacle_channels,
     relative_points,
-    sign_vector,
     slot_channels,
 )
 
@@ -53,7 +52,6 @@ __all__ = [  # with the views, so that models name one module
     "pad_channels",
     "relative_points",
     "sense",
-    "sign_vector",
     "slot_channels",
     "slot_features",
     "without_empty_slots",

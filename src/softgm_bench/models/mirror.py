@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from softgm_bench.envs import entries
 from softgm_bench.models import graph
+from softgm_bench.rod.sync import constant
 
 if TYPE_CHECKING:
     from softgm_bench.models.heads import AgentHead
@@ -33,8 +34,8 @@ def check_mirror(mirror: str | None) -> None:
     Raises:
         ValueError: with one line naming the key, its value and what would be right.
     """
-    if mirror not in (None, AVERAGE, CANONICAL):
-        raise ValueError(f"algo.actor.mirror is {mirror}: choose {AVERAGE}, {CANONICAL} or null")
+    if mirror is not None and mirror not in WAYS:
+        raise ValueError(f"algo.actor.mirror is {mirror}: choose {', '.join(WAYS)} or null")
 
 
 class MirroredHead(nn.Module):
@@ -83,13 +84,19 @@ class MirroredHead(nn.Module):
             agents = td.get(entries.AGENT_POSITION)
             state = agents.new_zeros(*agents.shape[:-1], self.states * self.memory.size)
             td.set(entries.MEMORY, state)
-        for view, part in zip(views, state.chunk(self.states, dim=-1), strict=True):
-            view.set(entries.IS_INIT, td.get(entries.IS_INIT)).set(entries.MEMORY, part)
-        return views
+        known = td.get(entries.IS_INIT)
+        return [
+            view.select(*self.in_keys, strict=False).set(entries.IS_INIT, known).set(entries.MEMORY, part)
+            for view, part in zip(views, state.chunk(self.states, dim=-1), strict=True)
+        ]
 
     def sights(self, td: TensorDictBase) -> list[TensorDictBase]:
-        """Observations that the head sees, in tensordicts that may be written to."""
+        """What the head sees, but for what it remembers; not to be written to."""
         raise NotImplementedError
+
+    def mirrored(self, answer: Tensor) -> Tensor:
+        """S f of an answer f, ``(..., N, outputs)``."""
+        return answer * constant(self.signs, answer.device, torch.float32)
 
     def answers(self, td: TensorDictBase) -> list[Tensor]:
         """The head's, ``(..., N, outputs)`` for each view; what it remembers of one step is written to ``td``."""
@@ -109,11 +116,11 @@ class Averaged(MirroredHead):
     def forward(self, td: TensorDictBase) -> Tensor:
         """``(..., N, outputs)``."""
         here, there = self.answers(td)
-        return 0.5 * (here + there * graph.sign_vector(self.signs, there.device))
+        return 0.5 * (here + self.mirrored(there))
 
     def sights(self, td: TensorDictBase) -> list[TensorDictBase]:
         """What is there, and its image."""
-        return [td.select(*self.in_keys, strict=False), graph.mirrored(td, self.privileged_image)]
+        return [td, graph.mirrored(td, self.privileged_image)]
 
 
 class Canonical(MirroredHead):
@@ -122,8 +129,7 @@ class Canonical(MirroredHead):
     def forward(self, td: TensorDictBase) -> Tensor:
         """``(..., N, outputs)``."""
         (answer,) = self.answers(td)
-        turned = self._turned(td).unsqueeze(-2)
-        return torch.where(turned, answer * graph.sign_vector(self.signs, answer.device), answer)
+        return torch.where(self._turned(td).unsqueeze(-2), self.mirrored(answer), answer)
 
     def sights(self, td: TensorDictBase) -> list[TensorDictBase]:
         """What is there, or its image where the target is on the right."""
