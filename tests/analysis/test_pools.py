@@ -1,7 +1,7 @@
 import pytest
 
 from made_up_runs import write_evaluation, write_run
-from softgm_bench.analysis.pools import comparable, newest, pool_evaluations, pool_runs, wilson
+from softgm_bench.analysis.pools import by_condition, comparable, newest, pool_evaluations, pool_runs, wilson
 from softgm_bench.analysis.runs import find
 from softgm_bench.analysis.statistics import Bootstrap
 
@@ -93,6 +93,17 @@ def test_evaluations_are_pooled_by_condition_and_other_settings_are_not(tmp_path
     assert {condition: pool.seeds for (_, _, condition), pool in pools.items()} == {
         "noise (position sigma 0.1)": 2,
         "noise (position sigma 0.2)": 1,
+    }
+
+
+def test_only_what_was_evaluated_under_a_perturbation_has_rows_of_conditions_beside_the_papers_own(tmp_path):
+    for label in ("mappo", "ippo"):
+        write_evaluation(tmp_path / label, "wall", label, 0, {"name": "none"})
+    write_evaluation(tmp_path / "mappo_noise", "wall", "mappo", 0, {"name": "noise", "position_sigma": 0.1})
+    rows = by_condition({}, pool_evaluations(find(tmp_path).evaluations))
+    assert {subject: [name for name, pool in conditions if pool] for subject, conditions in rows.items()} == {
+        ("wall", "softgm"): [],
+        ("wall", "mappo"): ["none", "noise"],
     }
 
 

@@ -88,7 +88,9 @@ def _comparison(pools: Pools, bootstrap: Bootstrap) -> list[Block | None]:
 def _robustness(found: Found, pools: Pools, bootstrap: Bootstrap) -> list[Block | None]:
     perturbed = pool_evaluations(found.evaluations)
     conditions = by_condition(pools, perturbed)
-    evaluated = {subject: rows for subject, rows in conditions.items() if subject in {key[:2] for key in perturbed}}
+    evaluated = {
+        subject: rows for subject, rows in conditions.items() if any(pool for name, pool in rows if name != "none")
+    }
     pairs = interventions.pairs(found.evaluations)
     return [
         tables.table_two(pools, conditions, bootstrap),

@@ -191,12 +191,12 @@ def condition(evaluation: Evaluation) -> str:
 
 
 def by_condition(nominal: Pools, perturbed: Mapping[tuple[str, str, str], Pool]) -> Conditions:
-    """Order what was evaluated, and the paper's SoftGM on the wall in any case, by task and algorithm.
+    """Order what was perturbed, and in any case the paper's SoftGM on the wall, by task and algorithm.
 
     Each has the nominal condition, the paper's three and others, with its pool or None; a name with several parameters
     keeps them.
     """
-    subjects = sorted({(task, label) for task, label, _ in perturbed} | {("wall", "softgm")}, key=_order)
+    subjects = sorted({key[:2] for key in perturbed if key[2] != "none"} | {("wall", "softgm")}, key=_order)
     rows: dict[tuple[str, str], list[tuple[str, Pool | None]]] = {subject: [] for subject in subjects}
     for subject in subjects:
         there = {full: pool for (*key, full), pool in perturbed.items() if tuple(key) == subject}
