@@ -78,9 +78,9 @@ parity: setup
 validation: setup
 	$(BIN)/python benchmarks/validation.py
 
-# The example report, from the committed runs and evaluations.
+# The example report, of the campaign: its finished cells and their evaluations.
 report: setup
-	$(BIN)/python -m softgm_bench.report experiments/trained evaluations=experiments/robustness out=experiments/report
+	$(BIN)/python -m softgm_bench.report experiments/campaign out=experiments/report
 
 # The site, in build/site; warnings are errors. Read it with: python -m http.server -d build/site
 docs: setup

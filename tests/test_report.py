@@ -55,8 +55,7 @@ def test_the_committed_report_is_what_the_committed_runs_give(tmp_path, monkeypa
     if made_with["matplotlib"] != matplotlib.__version__:
         pytest.skip(f"made with matplotlib {made_with['matplotlib']}, here is {matplotlib.__version__}")
     monkeypatch.setitem(matplotlib.rcParams, "axes.facecolor", "red")  # a reader's own settings do not matter
-    runs, robustness = ROOT / "experiments" / "trained", ROOT / "experiments" / "robustness"
-    report([str(runs), f"evaluations={robustness}", f"out={tmp_path}"])
+    report([str(ROOT / "experiments" / "campaign"), f"out={tmp_path}"])
     made, committed = contents(tmp_path), contents(COMMITTED)
     assert made.keys() == committed.keys()
     assert [name for name in made if made[name] != committed[name]] == []
