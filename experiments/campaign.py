@@ -1,9 +1,9 @@
 """Tables of the campaign, whose cells are those of the published grids: ``python experiments/campaign.py``.
 
 A finished cell lies in ``experiments/campaign/<task>/<algorithm>/seed<seed>/`` as its run left it, without checkpoints.
-Rewrites three tables in ``docs/results.md``: every run with its budget, every cell of the grids, with what is missing,
-and the paper's Table II, from the evaluations in a cell's folder ``robustness``. A run counts only if it has the
-frames, the final episodes and the recipe that its grid asks for.
+Rewrites four tables in ``docs/results.md``: every run with its budget, what there is with three seeds, every cell of
+the grids, with what is missing, and the paper's Table II, from the evaluations in a cell's folder ``robustness``. A run
+counts only if it has the frames, the final episodes and the recipe that its grid asks for.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -13,7 +13,9 @@ from typing import Any
 
 from softgm_bench.analysis import paper
 from softgm_bench.analysis.markdown import compared, refilled
+from softgm_bench.analysis.pools import SEEDS, comparable, pool_runs
 from softgm_bench.analysis.runs import Found, Run, find
+from softgm_bench.analysis.statistics import Array, Bootstrap, Scores, mean, probability_of_improvement
 from softgm_bench.config import compose
 from softgm_bench.errors import UserError
 from softgm_bench.sweeps import launch
@@ -36,6 +38,11 @@ RUNS = (
     "| task | algorithm | seed | frames | minutes | success | 95 % interval | episodes | within 400 steps | motionless "
     "| torque, joint |"
 )
+SEEDED = (
+    "| task | algorithm | success of each seed | mean | 95 % interval over seeds | against SoftGM "
+    "| its 95 % interval | probability that a seed of SoftGM is better |"
+)
+BOOTSTRAP = Bootstrap(resamples=5000, seed=0)  # as a report's
 CONDITIONS = {  # rows of the table of perturbations: what ``softgm_bench.evaluate`` calls them
     "nominal": "none",
     "noise": "noise",
@@ -126,6 +133,37 @@ def run_table() -> str:
     return "\n".join(lines)
 
 
+def seed_table() -> str:
+    """What has three seeds or more, beside SoftGM where that has them too, with intervals over seeds."""
+    lines = [SEEDED, "|" + " --- |" * (SEEDED.count("|") - 1)]
+    pools = pool_runs(list(runs().values()))
+    for (task, label), pool in pools.items():
+        if pool.seeds < SEEDS:
+            continue
+        full, rates = pools.get((task, "softgm"), pool), pool.success_rates
+        assert rates is not None
+        each = ", ".join(f"{rate:.3f}" for rate in rates)
+        row = [f"`{task}`", label, each, f"{rates.mean():.3f}", _between(pool.success_interval(BOOTSTRAP))]
+        if pool is full or not comparable(pool, full):
+            row += [MISSING] * 3
+        else:
+            assert full.success_rates is not None
+            scores = [rates], [full.success_rates]
+            apart = BOOTSTRAP.interval(f"difference/{task}/{label}", _difference, *scores)
+            better = probability_of_improvement(*reversed(scores))
+            row += [f"{_difference(*scores):+.3f}", _between(apart, "+"), f"{better:.2f}"]
+        lines.append(f"| {' | '.join(row)} |")
+    return "\n".join(lines)
+
+
+def _difference(ours: Scores, theirs: Scores) -> Array:
+    return mean(ours) - mean(theirs)
+
+
+def _between(bounds: Sequence[float] | None, sign: str = "") -> str:
+    return MISSING if bounds is None else f"[{bounds[0]:{sign}.3f}, {bounds[1]:{sign}.3f}]"
+
+
 def cell_table() -> str:
     """Success of every cell of the grids, a dash where it is missing, and how many are."""
     wanted = dict.fromkeys(cell for grid in GRIDS for cell in cells(grid))
@@ -179,7 +217,12 @@ def _there(folders: Sequence[str]) -> int:
 
 def page(text: str) -> str:
     """``docs/results.md`` with its tables made anew."""
-    tables = {"campaign runs": run_table(), "campaign cells": cell_table(), "perturbations": perturbation_table()}
+    tables = {
+        "campaign runs": run_table(),
+        "campaign seeds": seed_table(),
+        "campaign cells": cell_table(),
+        "perturbations": perturbation_table(),
+    }
     return refilled(PAGE, text, tables)
 
 
