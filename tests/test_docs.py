@@ -52,6 +52,17 @@ def test_the_results_of_the_readme_are_those_of_the_committed_runs():
         assert [f"{success[key]:.3f}" for key in ("mean", "low", "high")] == stated, (task, algorithm)
 
 
+def test_the_hours_that_the_papers_table_takes_are_those_of_the_measured_rates():
+    measured = json.loads((ROOT / "benchmarks/results/training_zen3.json").read_text())["rows"]
+    seconds = {"PPO": 0.0, "off policy": 0.0}
+    for row in measured:
+        frames = compose_untyped([f"task={row['task']}"]).experiment.total_frames
+        kind = "PPO" if row["algo"] in ("softgm", "ippo", "mappo") else "off policy"
+        seconds[kind] += 3 * frames / row["frames_per_s"]
+    told = f"take {sum(seconds.values()) / 3600:.0f} hours, {seconds['off policy'] / 3600:.0f} of them with the four"
+    assert told in (ROOT / "docs/sweeps.md").read_text()
+
+
 def test_the_readme_is_short_and_has_no_link_that_leads_nowhere():
     readme = (ROOT / "README.md").read_text()
     assert readme.count("\n") <= 120
