@@ -79,6 +79,7 @@ SENSING = {  # rows of the page: folders
     "SoftGM, seed 1, `mirror=average`": "trials/wall_sense/seed1_average",
     "SoftGM without stage 1, seed 0, `mirror=average`": "trials/wall_sense/blind0_average",
     "SoftGM, seed 0, `mirror=canonical`": "trials/wall_sense/seed0_canonical",
+    "SoftGM, seed 0, one step of contact": "trials/wall_sense/contact1_seed0",
 }
 
 
@@ -175,6 +176,21 @@ FELT = {  # rows of the page: the evaluation whose contact each counts
     "SoftGM, seed 1, `mirror=average`, 3 M frames": "trials/wall_sense/seed1_average",
     "SoftGM without stage 1, seed 0, `mirror=average`, 1.53 M frames": "trials/wall_sense/blind0_average",
 }
+
+
+def test_what_is_said_of_a_wall_that_may_not_be_touched_is_what_its_trials_hold(results):
+    folder = ROOT / "experiments" / SENSING["SoftGM, seed 0, one step of contact"]
+    touched = touching(folder / "evaluations" / "none")
+    hidden = results.episodes_in(folder / "evaluations")["blind"]["success"].mean()
+    rates = f"{np.isfinite(touched).mean():.3f}", f"{(touched == 0).mean():.3f}"
+    left, right = by_side(np.isfinite(touched))
+    page = " ".join(results.PAGE.read_text().split())
+    told = "after {} million frames, in {} of the 500 scenes, in {} without any contact;"
+    assert told.format(millions(folder), *rates) in page
+    assert f"on one side again, {left} with the open opening on the left and {right} with it on the right," in page
+    assert f"Shown no obstacle it succeeds in {hidden:.3f}: what" in page
+    allowed = max((touching(ROOT / "experiments" / at / "evaluations" / "none") == 0).mean() for at in FELT.values())
+    assert f"trained with five steps none has more than {allowed:.2f}." in page
 
 
 @pytest.mark.parametrize("name", FELT)
