@@ -80,6 +80,7 @@ SENSING = {  # rows of the page: folders
     "SoftGM without stage 1, seed 0, `mirror=average`": "trials/wall_sense/blind0_average",
     "SoftGM, seed 0, `mirror=canonical`": "trials/wall_sense/seed0_canonical",
     "SoftGM, seed 0, one step of contact": "trials/wall_sense/contact1_seed0",
+    "SoftGM, seed 0, no contact, `mirror=average`": "trials/wall_sense/contact0_seed0_average",
 }
 
 
@@ -191,6 +192,11 @@ def test_what_is_said_of_a_wall_that_may_not_be_touched_is_what_its_trials_hold(
     assert f"Shown no obstacle it succeeds in {hidden:.3f}: what" in page
     allowed = max((touching(ROOT / "experiments" / at / "evaluations" / "none") == 0).mean() for at in FELT.values())
     assert f"trained with five steps none has more than {allowed:.2f}." in page
+    still = ROOT / "experiments" / SENSING["SoftGM, seed 0, no contact, `mirror=average`"]
+    with (still / "metrics.csv").open() as file:
+        lengths = [float(row["episode_length"]) for row in csv.DictReader(file)]
+    told = f"After {millions(still)} million frames its episodes last {np.mean(lengths[-10:]):.0f} of 60 steps, and"
+    assert told in page
 
 
 @pytest.mark.parametrize("name", FELT)
