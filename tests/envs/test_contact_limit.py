@@ -1,10 +1,12 @@
 """A task may end an episode as failed after too many control steps of contact, and have a surface of its own."""
 
 import dataclasses
+from contextlib import nullcontext
 
 import pytest
 import torch
 
+from dense import force_dense
 from softgm_bench.envs import entries, make_env
 from softgm_bench.envs.verdict import judge_dense
 from softgm_bench.episodes.evaluation import evaluate
@@ -27,8 +29,9 @@ def pressing(env, steps):
 
 @pytest.fixture
 def limited(settings):
-    def build(limit, num_envs=3, **options):
-        config = dataclasses.replace(settings("task=wall_touch").task, max_contact_steps=limit, wall_x=0.25)
+    def build(limit, num_envs=3, task=None, **options):
+        changes = {"max_contact_steps": limit, "wall_x": 0.25} | (task or {})
+        config = dataclasses.replace(settings("task=wall_touch").task, **changes)
         return make_env(config, ROD, num_envs, seed=0, **options)
 
     return build
@@ -56,6 +59,53 @@ def test_the_count_begins_anew_with_an_episode(limited):
     mask = torch.tensor([True, False, False])
     env.reset(frames[-1].clone().set("_reset", mask.unsqueeze(-1)))
     assert env.simulator.state.episodes.contact_steps.tolist() == [0, 5, 5]
+
+
+@pytest.fixture
+def eased(limited, settings):
+    def build(curriculum, **options):
+        task = settings("task=wall_touch", "task.curriculum.enabled=true", "task.curriculum.stages=4").task
+        config = dataclasses.replace(task.curriculum, easy_contact_steps=6)
+        return limited(2, task={"curriculum": config}, curriculum=curriculum, **options)
+
+    return build
+
+
+@pytest.mark.parametrize("dense", [False, True], ids=["rows", "all rows"])
+@pytest.mark.parametrize("stage", range(5))
+def test_easier_scenes_allow_more_contact_and_the_tasks_own_no_more_than_the_task(eased, stage, dense):
+    env = eased(True)
+    state = env.simulation_state()
+    state["progress", "stage"].fill_(stage)
+    env.load_simulation_state(state)
+    with force_dense() if dense else nullcontext():
+        frames = pressing(env, 70)
+    touched = torch.stack([frame[entries.CONTACT_NODES].squeeze(-1) > 0.0 for frame in frames]).cumsum(0)
+    failed = torch.stack([frame[entries.CONTACT_FAILURE].squeeze(-1) for frame in frames])
+    for row in range(3):
+        last = int((touched[:, row] == 7 - stage).nonzero()[0])  # 6, 5, 4, 3, 2 are allowed
+        assert failed[:, row].nonzero().flatten().tolist() == [last]
+
+
+def test_evaluations_allow_what_the_task_does_whatever_training_began_with(eased):
+    env = eased(False)
+    assert not env.simulator.state.episodes.contact_steps.any()
+    pressing(env, 60)
+    assert (env.simulator.state.episodes.contact_steps == 3).all()
+
+
+def test_environments_behind_the_leading_ones_allow_what_their_own_difficulty_does(settings):
+    words = ("enabled=true", "stages=4", "easier_share=0.5", "easy_contact_steps=100")
+    task = settings("task=wall_touch", *(f"task.curriculum.{word}" for word in words)).task
+    env = make_env(task, ROD, 4, seed=0, curriculum=True)
+    state = env.simulation_state()
+    state["progress", "stage"].fill_(3)
+    env.load_simulation_state(state)
+    env.reset()
+    episodes = env.simulator.state.episodes
+    assert episodes.difficulty[0] == 0.75 > episodes.difficulty[3]
+    further = (100 - task.max_contact_steps) * (1.0 - episodes.difficulty)
+    assert torch.equal(-episodes.contact_steps, further.round().to(torch.int64))
 
 
 def test_contact_that_ends_an_episode_is_no_success_even_at_the_target(settings):

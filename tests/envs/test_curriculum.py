@@ -18,7 +18,9 @@ from softgm_bench.envs.tasks.base import CurriculumConfig, eased
 from softgm_bench.errors import UserError
 
 ENABLED = "task.curriculum.enabled=true"
-FOUR = CurriculumConfig(enabled=True, stages=2, episodes=4, promote=0.6, demote=0.2, easier_share=0.0)
+FOUR = CurriculumConfig(
+    enabled=True, stages=2, episodes=4, promote=0.6, demote=0.2, easier_share=0.0, easy_contact_steps=None
+)
 
 
 def level(value):
@@ -324,6 +326,10 @@ def test_targets_of_the_other_tasks_fill_ranges_between_the_easiest_and_their_ow
         ("task.curriculum.demote=-0.1", r"task.curriculum.demote is -0.1"),
         ("task.curriculum.easier_share=1.0", r"task.curriculum.easier_share is 1.0: it must be at least 0 and below 1"),
         ("task.curriculum.easier_share=-0.1", r"task.curriculum.easier_share is -0.1"),
+        (
+            "task.curriculum.easy_contact_steps=3",
+            r"task.curriculum.easy_contact_steps is 3, task.max_contact_steps None",
+        ),
         ("task.curriculum.easy_opening_side=0.2", r"task.curriculum.easy_opening_side is 0.2"),
         ("task.curriculum.easy_target_offset=1.5", r"task.curriculum.easy_target_offset is 1.5: it must lie between"),
         ("task.curriculum.target_power=0.0", r"task.curriculum.target_power is 0.0: it must be above 0"),

@@ -19,6 +19,7 @@ NEUTRAL: dict[str, Any] = {
     "task.velocity_damping_coefficient": None,
     "task.reward.lambda_fail": 0.0,
     "task.curriculum.easier_share": 0.0,
+    "task.curriculum.easy_contact_steps": None,
     "task.curriculum.easy_target_offset": 0.0,
     "task.curriculum.target_power": 1.0,
     "algo.actor.embedding_norm": False,

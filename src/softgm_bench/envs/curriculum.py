@@ -17,7 +17,7 @@ import torch
 from tensordict import TensorClass
 from torch import Tensor
 
-from softgm_bench.envs.tasks.base import CurriculumConfig
+from softgm_bench.envs.tasks.base import CurriculumConfig, TaskConfig
 
 
 class Progress(TensorClass):
@@ -51,6 +51,17 @@ def first_progress(num_envs: int, device: torch.device) -> Progress:
 def difficulty(progress: Progress, config: CurriculumConfig) -> Tensor:
     """Give the difficulty of the scenes to be drawn now: from 0 to exactly 1, float64 without dimensions."""
     return progress.stage[0].to(torch.float64) / config.stages
+
+
+def further_contact(level: Tensor, config: TaskConfig) -> Tensor | None:
+    """Give how many more steps in contact than the task scenes of a difficulty allow, int64; None where none ever does.
+
+    They fall on a straight line to 0 at the task's own scenes, each rounded to a whole step.
+    """
+    easy, own = config.curriculum.easy_contact_steps, config.max_contact_steps
+    if easy is None or own is None:
+        return None
+    return ((easy - own) * (1.0 - level)).round().to(torch.int64)
 
 
 def leading(num_envs: int, config: CurriculumConfig) -> int:

@@ -16,7 +16,7 @@ from tensordict import TensorClass, TensorDictBase
 from torch import Tensor
 
 from softgm_bench.envs import entries
-from softgm_bench.envs.curriculum import Progress, difficulty, first_progress, leading, note_ends
+from softgm_bench.envs.curriculum import Progress, difficulty, first_progress, further_contact, leading, note_ends
 from softgm_bench.envs.perturbation import Perturbation, PerturbationConfig
 from softgm_bench.envs.sensing import Bins, Sight, SlotTable, bins_per_cylinder, cut_into_bins, empty_table, look
 from softgm_bench.envs.tasks.base import Scene, Task
@@ -45,7 +45,8 @@ class Episodes(TensorClass):
             slots where nothing moves.
         previous_action: as the sections applied it, ``(num_envs, n_agents, 2)`` float32; 0 after a reset.
         steps: control steps since the reset, ``(num_envs,)`` int64.
-        contact_steps: those of them that ended in contact, where the task limits them, ``(num_envs,)`` int64.
+        contact_steps: those of them that ended in contact, where the task limits them, ``(num_envs,)`` int64; counted
+            from below 0 where an easier scene allows more.
         terminated: success, divergence or too much contact, ``(num_envs,)`` bool.
         truncated: the horizon, ``(num_envs,)`` bool.
         difficulty: of the scene, from 0 to 1, the task's own, ``(num_envs,)`` float32.
@@ -265,6 +266,7 @@ class Simulator:
         scene = drawn.apply(self._real)
         bins = self._cut(scene)
         body = blank.body if self.randomise is None else draw(self.randomise, count, self._body_generator)
+        further = None if level is None else further_contact(level, self.task.config)
         episodes = Episodes(
             rod=blank.rod,
             scene=scene,
@@ -273,7 +275,7 @@ class Simulator:
             shown=blank.shown,
             previous_action=blank.previous_action,
             steps=blank.table.count,
-            contact_steps=blank.table.count,
+            contact_steps=blank.table.count if further is None else -further,
             terminated=blank.never,
             truncated=blank.never,
             difficulty=blank.whole if level is None else level.to(torch.float32),

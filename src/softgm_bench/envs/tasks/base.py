@@ -60,6 +60,7 @@ class CurriculumConfig:
     promote: float
     demote: float
     easier_share: float
+    easy_contact_steps: int | None
 
     def __post_init__(self) -> None:
         """Refuse values by which nothing could be decided.
@@ -118,6 +119,12 @@ class TaskConfig:
             raise ValueError(f"task.train_horizon is {self.train_horizon}: it must be at least 1, or null")
         if self.max_contact_steps is not None and self.max_contact_steps < 0:
             raise ValueError(f"task.max_contact_steps is {self.max_contact_steps}: it must be at least 0, or null")
+        own, easy = self.max_contact_steps, self.curriculum.easy_contact_steps
+        if easy is not None and (own is None or easy < own):
+            raise ValueError(
+                f"task.curriculum.easy_contact_steps is {easy}, task.max_contact_steps {own}: "
+                "the easiest scenes allow no less contact than the task, whose limit must be a number; null: as much"
+            )
         for name in ("friction_coefficient", "velocity_damping_coefficient"):
             value = getattr(self, name)
             if value is not None and not value >= 0.0:
