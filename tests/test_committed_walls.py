@@ -81,6 +81,7 @@ SENSING = {  # rows of the page: folders
     "SoftGM, seed 0, `mirror=canonical`": "trials/wall_sense/seed0_canonical",
     "SoftGM, seed 0, one step of contact": "trials/wall_sense/contact1_seed0",
     "SoftGM, seed 0, no contact, `mirror=average`": "trials/wall_sense/contact0_seed0_average",
+    "SoftGM, seed 0, no contact, `easy_contact_steps=5`, `mirror=average`": "trials/wall_sense/eased0_seed0_average",
 }
 
 
@@ -196,6 +197,11 @@ def test_what_is_said_of_a_wall_that_may_not_be_touched_is_what_its_trials_hold(
     with (still / "metrics.csv").open() as file:
         lengths = [float(row["episode_length"]) for row in csv.DictReader(file)]
     told = f"After {millions(still)} million frames its episodes last {np.mean(lengths[-10:]):.0f} of 60 steps, and"
+    assert told in page
+    eased = ROOT / "experiments" / SENSING["SoftGM, seed 0, no contact, `easy_contact_steps=5`, `mirror=average`"]
+    with (eased / "metrics.csv").open() as file:
+        reached_then = float(list(csv.DictReader(file))[-1]["difficulty"])
+    told = f"had reached a difficulty of {reached_then:.1f} when the clock stopped it after {millions(eased)} million"
     assert told in page
 
 
