@@ -76,6 +76,26 @@ def test_the_hours_that_the_papers_table_takes_are_those_of_the_measured_rates()
     assert told in (ROOT / "docs/sweeps.md").read_text()
 
 
+def test_the_launches_that_the_page_on_the_environment_tells_are_those_that_were_counted():
+    counts = {}
+    for when in ("operations_before_kernels", "operations"):
+        for row in json.loads((ROOT / f"benchmarks/results/{when}.json").read_text())["rows"]:
+            if row["part"] == "all":
+                counts[row["what"], row["task"], when] = str(row["operations"])
+    page = (ROOT / "docs/environment.md").read_text()
+    for told, what in (
+        ("a step of the environment with its resets", "environment step"),
+        ("a call of SoftGM's policy", "policy call"),
+        ("a gradient step of PPO with SoftGM", "gradient step"),
+    ):
+        cells = [
+            counts[what, task, when]
+            for task in ("basic", "wall")
+            for when in ("operations_before_kernels", "operations")
+        ]
+        assert f"| {told} | {' | '.join(cells)} |" in page
+
+
 def test_the_readme_is_short_and_has_no_link_that_leads_nowhere():
     readme = (ROOT / "README.md").read_text()
     assert readme.count("\n") <= 120

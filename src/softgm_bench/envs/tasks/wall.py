@@ -49,7 +49,7 @@ class WallCurriculumConfig(CurriculumConfig):
         """The share of its distance in y and z from the opening's centre that a target keeps; exactly 1 at the end."""
         # 1 keeps the digits that were there before there was a power
         own = difficulty if self.target_power == 1.0 else 1.0 - (1.0 - difficulty) ** self.target_power
-        return own + self.easy_target_offset * (1.0 - own)
+        return own if self.easy_target_offset == 0.0 else own + self.easy_target_offset * (1.0 - own)
 
 
 @dataclass
