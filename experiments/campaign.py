@@ -13,11 +13,12 @@ from typing import Any
 
 from softgm_bench.analysis import paper
 from softgm_bench.analysis.markdown import compared, refilled
-from softgm_bench.analysis.pools import SEEDS, comparable, pool_runs
+from softgm_bench.analysis.pools import SEEDS, lead, pool_runs
 from softgm_bench.analysis.runs import Found, Run, find
-from softgm_bench.analysis.statistics import Array, Bootstrap, Scores, mean, probability_of_improvement
+from softgm_bench.analysis.statistics import Bootstrap, probability_of_improvement
 from softgm_bench.config import compose
 from softgm_bench.errors import UserError
+from softgm_bench.report import Options
 from softgm_bench.sweeps import launch
 
 ROOT = Path(__file__).parents[1]
@@ -42,7 +43,7 @@ SEEDED = (
     "| task | algorithm | success of each seed | mean | 95 % interval over seeds | against SoftGM "
     "| its 95 % interval | probability that a seed of SoftGM is better |"
 )
-BOOTSTRAP = Bootstrap(resamples=5000, seed=0)  # as a report's
+BOOTSTRAP = Bootstrap(Options.resamples, Options.seed)  # as a report's
 CONDITIONS = {  # rows of the table of perturbations: what ``softgm_bench.evaluate`` calls them
     "nominal": "none",
     "noise": "noise",
@@ -144,20 +145,15 @@ def seed_table() -> str:
         assert rates is not None
         each = ", ".join(f"{rate:.3f}" for rate in rates)
         row = [f"`{task}`", label, each, f"{rates.mean():.3f}", _between(pool.success_interval(BOOTSTRAP))]
-        if pool is full or not comparable(pool, full):
+        ahead = lead(pool, full, BOOTSTRAP)
+        if ahead is None:
             row += [MISSING] * 3
         else:
             assert full.success_rates is not None
-            scores = [rates], [full.success_rates]
-            apart = BOOTSTRAP.interval(f"difference/{task}/{label}", _difference, *scores)
-            better = probability_of_improvement(*reversed(scores))
-            row += [f"{_difference(*scores):+.3f}", _between(apart, "+"), f"{better:.2f}"]
+            better = probability_of_improvement([full.success_rates], [rates])
+            row += [f"{ahead[0]:+.3f}", _between(ahead[1:], "+"), f"{better:.2f}"]
         lines.append(f"| {' | '.join(row)} |")
     return "\n".join(lines)
-
-
-def _difference(ours: Scores, theirs: Scores) -> Array:
-    return mean(ours) - mean(theirs)
 
 
 def _between(bounds: Sequence[float] | None, sign: str = "") -> str:

@@ -29,17 +29,21 @@ def row_of(page, name):
     return [cell.strip() for cell in re.search(rf"^\| {re.escape(name)} \|(.*)\|$", page, re.MULTILINE)[1].split("|")]
 
 
+def rows(path):
+    """A committed table."""
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
 def touching(folder):
     """Control steps in contact of each episode of an evaluation, infinitely many where it failed."""
-    with (folder / "episodes.csv").open() as file:
-        episodes = list(csv.DictReader(file))
+    episodes = rows(folder / "episodes.csv")
     return np.array([int(row["contact_steps"]) if row["success"] == "True" else np.inf for row in episodes])
 
 
 def millions(folder):
     """Frames of a training, as the page tells them."""
-    with (folder / "metrics.csv").open() as file:
-        return f"{int(list(csv.DictReader(file))[-1]['frames']) / 1e6:.2f}"
+    return f"{int(rows(folder / 'metrics.csv')[-1]['frames']) / 1e6:.2f}"
 
 
 def by_side(success):
@@ -194,13 +198,11 @@ def test_what_is_said_of_a_wall_that_may_not_be_touched_is_what_its_trials_hold(
     allowed = max((touching(ROOT / "experiments" / at / "evaluations" / "none") == 0).mean() for at in FELT.values())
     assert f"trained with five steps none has more than {allowed:.2f}." in page
     still = ROOT / "experiments" / SENSING["SoftGM, seed 0, no contact, `mirror=average`"]
-    with (still / "metrics.csv").open() as file:
-        lengths = [float(row["episode_length"]) for row in csv.DictReader(file)]
+    lengths = [float(row["episode_length"]) for row in rows(still / "metrics.csv")]
     told = f"After {millions(still)} million frames its episodes last {np.mean(lengths[-10:]):.0f} of 60 steps, and"
     assert told in page
     eased = ROOT / "experiments" / SENSING["SoftGM, seed 0, no contact, `easy_contact_steps=5`, `mirror=average`"]
-    with (eased / "metrics.csv").open() as file:
-        reached_then = float(list(csv.DictReader(file))[-1]["difficulty"])
+    reached_then = float(rows(eased / "metrics.csv")[-1]["difficulty"])
     told = f"had reached a difficulty of {reached_then:.1f} when the clock stopped it after {millions(eased)} million"
     assert told in page
 
@@ -228,11 +230,11 @@ def test_what_is_said_of_the_curriculum_is_what_the_committed_trainings_hold(res
     page = " ".join(results.PAGE.read_text().split())
     told = []
     for name in ("SoftGM, seed 1", "SoftGM, seed 0", "SoftGM, seed 1, `promote=0.75`"):
-        with (ROOT / "experiments" / SENSING[name] / "metrics.csv").open() as file:
-            rows = [row for row in csv.DictReader(file) if 480_000 < int(row["frames"]) <= 550_000]
-        episodes = np.array([int(row["episodes"]) for row in rows])
-        success = np.array([float(row["success_rate"]) for row in rows])[episodes > 0]
-        difficulty = np.mean([float(row["difficulty"]) for row in rows])
+        metrics = rows(ROOT / "experiments" / SENSING[name] / "metrics.csv")
+        there = [row for row in metrics if 480_000 < int(row["frames"]) <= 550_000]
+        episodes = np.array([int(row["episodes"]) for row in there])
+        success = np.array([float(row["success_rate"]) for row in there])[episodes > 0]
+        difficulty = np.mean([float(row["difficulty"]) for row in there])
         told += [f"{difficulty:.2f}", f"{np.average(success, weights=episodes[episodes > 0]):.2f}"]
     said = "at a difficulty of {} with {} of its episodes successes, .*; seed 0 at {} with {}\\..* at {}, with {}\\."
     assert re.search(said.format(*told), page), told

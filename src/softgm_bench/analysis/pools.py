@@ -7,7 +7,7 @@ import numpy as np
 
 from softgm_bench.analysis import paper
 from softgm_bench.analysis.runs import TUNED, Evaluation, Run
-from softgm_bench.analysis.statistics import Array, Bootstrap, mean
+from softgm_bench.analysis.statistics import Array, Bootstrap, Scores, mean
 
 ORACLE, CURRICULUM, PERTURBED, SMOKE = "†", "‡", "§", "¶"
 MARKS = {
@@ -102,6 +102,23 @@ def equal_frames(pools: Sequence[Pool]) -> bool:
 def comparable(*pools: Pool) -> bool:
     """Tell whether algorithms can be compared: each has ``SEEDS`` seeds or more, and all had equal frames."""
     return all(pool.seeds >= SEEDS for pool in pools) and equal_frames(pools)
+
+
+def lead(pool: Pool, other: Pool, bootstrap: Bootstrap) -> tuple[float, float, float] | None:
+    """Give the difference of an algorithm's success to another's on a task, and its 95 % interval over seeds.
+
+    None where they cannot be compared, or without a notion of success.
+    """
+    ours, theirs = pool.success_rates, other.success_rates
+    if pool is other or not comparable(pool, other) or ours is None or theirs is None:
+        return None
+
+    def difference(first: Scores, second: Scores) -> Array:
+        return mean(first) - mean(second)
+
+    key = f"difference/{pool.evaluations[0].task}/{pool.label}"
+    low, high = bootstrap.interval(key, difference, [ours], [theirs])
+    return float(difference([ours], [theirs])), float(low), float(high)
 
 
 def wilson(evaluation: Evaluation) -> tuple[float, float]:

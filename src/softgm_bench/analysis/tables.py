@@ -14,13 +14,13 @@ from softgm_bench.analysis.pools import (
     Conditions,
     Pool,
     Pools,
-    comparable,
     condition,
     equal_frames,
+    lead,
     wilson,
 )
 from softgm_bench.analysis.runs import Evaluation, Problem, Run
-from softgm_bench.analysis.statistics import Bootstrap, mean
+from softgm_bench.analysis.statistics import Bootstrap
 
 Row = list[Cell | str]  # a plain cell may be its text
 SIGNIFICANT = "*"
@@ -138,14 +138,8 @@ def _rank(pool: Pool | None, rank: int | None) -> Cell | str:
 
 def _differs(pool: Pool | None, full: Pool | None, bootstrap: Bootstrap) -> bool:
     """Tell whether the interval over seeds of the difference of an algorithm's success to SoftGM's leaves out 0."""
-    if pool is None or full is None or pool is full or not comparable(pool, full):
-        return False
-    ours, theirs = pool.success_rates, full.success_rates
-    if ours is None or theirs is None:
-        return False
-    key = f"difference/{pool.evaluations[0].task}/{pool.label}"
-    low, high = bootstrap.interval(key, lambda first, second: mean(first) - mean(second), [ours], [theirs])
-    return bool(low > 0.0 or high < 0.0)
+    found = None if pool is None or full is None else lead(pool, full, bootstrap)
+    return found is not None and (found[1] > 0.0 or found[2] < 0.0)
 
 
 def _comparability(pools: Sequence[Pool]) -> list[str]:
