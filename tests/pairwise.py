@@ -1,4 +1,4 @@
-"""Products of factors of which the quick tier takes a pairwise cover and `make test-all` everything."""
+"""Parameters of which the quick tier takes some, of products a pairwise cover, and `make test-all` everything."""
 
 from itertools import combinations, product
 
@@ -24,3 +24,10 @@ def pairwise(*factors, slow=()):
     rows = list(product(*factors))
     quick = cover([row for row in rows if not set(row) & set(slow)])
     return [pytest.param(*row, marks=() if row in quick else pytest.mark.slow) for row in rows]
+
+
+def partly(values, quick):
+    """Parameters for the values, by the names of a mapping if it is one; those but the ``quick`` ones are slow."""
+    named = values.items() if isinstance(values, dict) else [(None, value) for value in values]
+    marks = [() if (value if name is None else name) in quick else pytest.mark.slow for name, value in named]
+    return [pytest.param(value, id=name, marks=mark) for (name, value), mark in zip(named, marks, strict=True)]

@@ -49,7 +49,7 @@ MISTAKES = {
     "no override": (["wall"], "settings are written key=value"),
     "dashes": (["--seed=3"], "--seed=3: no such option; settings are written without dashes: seed=value"),
 }
-SLOW = ("misspelt key", "zero environments", "no override")  # they take the way out of another
+SLOW = ("misspelt key", "negative seed", "zero environments", "no override")  # they take the way out of another
 
 
 @pytest.mark.parametrize(
@@ -87,6 +87,7 @@ def test_a_run_leaves_a_complete_folder_and_is_not_replaced_by_accident(tmp_path
     assert (folder / "summary.json").read_bytes() == before
 
 
+@pytest.mark.slow
 def test_a_sweep_runs_every_job_and_reports_each_that_fails(tmp_path):
     done = tmp_path / "outputs/basic/softgm/seed0"
     done.mkdir(parents=True)
@@ -106,7 +107,7 @@ def test_a_sweep_runs_every_job_and_reports_each_that_fails(tmp_path):
     ("number", "code"),
     [
         (signal.SIGINT, 130),
-        (signal.SIGTERM, 143),
+        pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow),
         pytest.param(signal.SIGHUP, 129, marks=pytest.mark.slow),
         pytest.param(signal.SIGUSR1, 138, marks=pytest.mark.slow),
     ],

@@ -335,6 +335,7 @@ def test_a_mistake_is_answered_by_one_line_and_leaves_nothing_behind(run, tmp_pa
     assert sorted(path.name for path in tmp_path.iterdir()) == before
 
 
+@pytest.mark.slow
 def test_the_process_ends_with_the_status(tmp_path):
     command = [sys.executable, "-m", "softgm_bench.evaluate", "nowhere"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)

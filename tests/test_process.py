@@ -3,6 +3,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from softgm_bench import process
 
 
@@ -75,6 +77,7 @@ def test_products_are_rounded_where_that_is_asked_for_and_the_processor_can():
     assert python(code) == ("False\nTrue" if able else refused)
 
 
+@pytest.mark.slow
 def test_asking_for_the_python_interface_prepares_the_process_before_torch_is_loaded():
     seen = "print(os.environ['GOMP_SPINCOUNT'], os.environ['ONEDNN_MAX_CPU_ISA'])"
     for asking in ("softgm_bench.train", "from softgm_bench import api"):

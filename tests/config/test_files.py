@@ -4,6 +4,7 @@ import pytest
 from omegaconf import DictConfig, OmegaConf
 
 from every_task import TASKS
+from pairwise import pairwise, partly
 from softgm_bench.algorithms import algorithm_configs
 from softgm_bench.assembly import configure
 from softgm_bench.config import compose, config_directory, plain
@@ -29,7 +30,7 @@ def test_there_are_few_files_and_each_stands_in_a_group():
     assert all("optional" not in str(entry) and "$" not in str(entry) for entry in defaults)
 
 
-@pytest.mark.parametrize("experiment", ["default", "quick", "smoke", "gpu"])
+@pytest.mark.parametrize("experiment", ["default", *partly(["quick", "smoke", "gpu"], ["smoke"])])
 @pytest.mark.parametrize("task", TASK_CONFIGS)
 def test_every_combination_of_files_is_valid(task, experiment):
     config = configure([f"task={task}", f"experiment={experiment}", "seed=3", "device=cpu"])
@@ -95,9 +96,9 @@ def test_a_smoke_run_is_small_and_takes_gradient_steps_whatever_the_recipe(algo,
         assert config.algo.batch_size <= frames
 
 
-@pytest.mark.parametrize("recipe", ["paper", "tuned"])
-@pytest.mark.parametrize("algo", algorithm_configs())
-@pytest.mark.parametrize("task", ["basic", "wall"])
+@pytest.mark.parametrize(
+    ("task", "algo", "recipe"), pairwise(["basic", "wall"], list(algorithm_configs()), ["paper", "tuned"])
+)
 def test_a_gpu_run_is_valid_without_a_gpu_and_large_everywhere(task, algo, recipe):
     config = configure([f"task={task}", f"algo={algo}", f"recipe={recipe}", "experiment=gpu", "device=cpu"])
     usual = compose([f"task={task}", f"algo={algo}", f"recipe={recipe}"])

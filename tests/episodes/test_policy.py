@@ -76,6 +76,7 @@ def test_what_holds_no_policy_is_refused_in_one_line(run, tmp_path):
         policy.load(tmp_path / "other.pt")
 
 
+@pytest.mark.slow
 def test_the_command_keeps_a_policy_or_says_what_is_wrong(run, tmp_path):
     command = [sys.executable, "-m", "softgm_bench.export"]
     done = subprocess.run([*command, run, tmp_path / "kept.pt"], capture_output=True, text=True, check=False)

@@ -2,6 +2,7 @@
 
 import csv
 import math
+from functools import cache
 from itertools import product
 
 import pytest
@@ -120,10 +121,16 @@ def wall():
     return make_env(compose(["task=wall"]).task, RodParameters(n_elements=20, substeps=1), num_envs=3, seed=0)
 
 
+@cache
+def settings_on_wall(algo, model, *overrides):
+    return compose(
+        ["task=wall", f"algo={algo}", f"model={model}", *(() if algo in ON_POLICY else TINY_OFF_POLICY), *overrides]
+    )
+
+
 def built(algo, model, env, *overrides):
     """An algorithm whose parameters are all drawn at random, so that no term is hidden by a zero or a small gain."""
-    sizes = () if algo in ON_POLICY else TINY_OFF_POLICY
-    config = compose(["task=wall", f"algo={algo}", f"model={model}", *sizes, *overrides])
+    config = settings_on_wall(algo, model, *overrides)
     algorithm = build_algorithm(config.algo, config.model, env, config.oracle)
     torch.manual_seed(0)
     with torch.no_grad():

@@ -8,6 +8,7 @@ import torch
 from interrupted import PPO, SMALL, TINY
 
 from kept_threads import kept_threads
+from pairwise import partly
 from softgm_bench import status
 from softgm_bench.algorithms.ppo import PPO as Algorithm
 from softgm_bench.analysis.runs import find
@@ -95,9 +96,11 @@ POISONS = {
 }
 
 
-@pytest.mark.parametrize(("what", "how"), POISONS.items(), ids=POISONS)
-def test_the_tensor_is_named_and_the_last_finite_checkpoint_stays(tmp_path, monkeypatch, what, how):
-    monkeypatch.setattr(Algorithm, "update", poisoned(how))
+@pytest.mark.parametrize(
+    "what", partly(list(POISONS), ["loss_critic is nan", "the parameter critic.", "the action holds nan"])
+)
+def test_the_tensor_is_named_and_the_last_finite_checkpoint_stays(tmp_path, monkeypatch, what):
+    monkeypatch.setattr(Algorithm, "update", poisoned(POISONS[what]))
     folder = RunFolder(tmp_path)
     overrides = [*SMALL, "experiment.evaluation.interval=80"]  # the fifth iteration's end
 

@@ -15,6 +15,7 @@ import torch
 from interrupted import PPO, SMALL, TINY, differences, start, state, written
 
 from kept_threads import kept_threads
+from pairwise import partly
 from softgm_bench.config import compose
 from softgm_bench.errors import UserError
 from softgm_bench.runs import checkpoint, ending, loop
@@ -75,6 +76,9 @@ RUNS = {
 }
 
 
+QUICK = ("softgm that remembers", "mappo in float32", "maddpg", "masac on VMAS")
+
+
 class Death(BaseException):
     """What nothing catches, as nothing catches a kill."""
 
@@ -126,7 +130,7 @@ def broken(tmp_path):
 # the numbers
 
 
-@pytest.mark.parametrize("overrides", RUNS.values(), ids=RUNS)
+@pytest.mark.parametrize("overrides", partly(RUNS, QUICK))
 def test_going_on_gives_the_numbers_of_a_run_that_was_never_broken_off(tmp_path, overrides):
     if "task=vmas_balance" in overrides:
         pytest.importorskip("vmas", reason="VMAS is an optional extra: pip install 'softgm-bench[vmas]'")
@@ -351,6 +355,7 @@ def test_a_run_whose_disk_was_full_goes_on_where_there_is_room_again(tmp_path, w
     assert written(tmp_path / "copy") == written(whole)
 
 
+@pytest.mark.slow
 def test_where_no_checkpoint_can_be_written_a_run_ends_before_it_trains(tmp_path, whole):
     process = start(*SMALL, f"run_dir={tmp_path}", file_size=20_000)
     process.join(120)

@@ -6,6 +6,7 @@ from itertools import product
 import pytest
 from omegaconf import OmegaConf
 
+from pairwise import partly
 from softgm_bench.config import config_directory
 from softgm_bench.errors import UserError
 from softgm_bench.sweeps import cell as sweep_cell
@@ -73,7 +74,7 @@ def test_a_grids_value_gives_way_to_the_command_lines():
     assert [str(cell.run_dir) for cell in found] == ["outputs/full/wall/softgm/seed7"]
 
 
-@pytest.mark.parametrize("size", ["", "_smoke"])
+@pytest.mark.parametrize("size", partly(["", "_smoke"], [""]))
 def test_named_grids_have_the_papers_cells_and_share_those_that_are_the_same(size):
     cells = {grid: sweep.cells([f"+grids={grid}{size}"])[0] for grid in ("table2", "ablation")}
     softgm = {cell.run_dir for cell in cells["table2"]}
@@ -84,6 +85,7 @@ def test_named_grids_have_the_papers_cells_and_share_those_that_are_the_same(siz
     assert softgm == {cell.run_dir for cell in sweep.cells([f"+grids=table1{size}", "algo=softgm", "task=wall"])[0]}
 
 
+@pytest.mark.slow
 def test_the_ladder_goes_from_blind_to_told_and_shares_the_wholes_runs():
     assert len(sweep.cells(["+grids=ladder"])[0]) == 36
     rungs = [str(cell.run_dir) for cell in sweep.cells(["+grids=ladder", "seed=1", "task=wall"])[0]]
@@ -97,7 +99,7 @@ def test_the_ladder_goes_from_blind_to_told_and_shares_the_wholes_runs():
     assert [str(cell.run_dir) for cell in recurrent] == [f"outputs/full/{task}/softgm_gru/seed1" for task in tasks]
 
 
-@pytest.mark.parametrize("size", ["", "_smoke"])
+@pytest.mark.parametrize("size", partly(["", "_smoke"], ["_smoke"]))
 def test_the_rivals_differ_in_the_model_alone_and_share_softgms_runs_with_the_ladder(size):
     cells = sweep.cells([f"+grids=rivals{size}"])[0]
     assert len(cells) == 27

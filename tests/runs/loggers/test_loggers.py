@@ -262,6 +262,7 @@ print("went on")
 LOGIN = "wandb: [wandb.login()] Loaded credentials for http://127.0.0.1:9 from WANDB_API_KEY.\n"
 
 
+@pytest.mark.slow
 def test_without_a_server_the_run_goes_on(tmp_path):
     pytest.importorskip("wandb")
     nobody = {"WANDB_BASE_URL": "http://127.0.0.1:9", "WANDB_API_KEY": "0" * 40}
