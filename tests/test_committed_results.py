@@ -107,8 +107,19 @@ def test_what_is_said_of_a_million_frames_of_basic_is_what_its_cells_hold(campai
     others = np.stack([final["mappo"], final["ippo"]])
     assert final["softgm"].min() > others.max() > others.min() > 0.657
     assert 0.0 < others[0].mean() - others[1].mean() < np.ptp(others, axis=1).min()
-    told = "on average {:.0f} and {:.0f} points above them".format(*100 * (final["softgm"].mean() - others.mean(1)))
-    assert told in " ".join(campaign.PAGE.read_text().split())
+    page = " ".join(campaign.PAGE.read_text().split())
+    assert (
+        "on average {:.0f} and {:.0f} points above them".format(*100 * (final["softgm"].mean() - others.mean(1)))
+        in page
+    )
+    whole, without2, without1, maddpg = (
+        campaign.runs()[f"basic/{label}/seed0"].summary["final_evaluation"]["success_rate"]["mean"]
+        for label in ("softgm", "softgm_no_stage2", "softgm_no_stage1", "maddpg")
+    )
+    assert maddpg > max(final["softgm"].max(), others.max())
+    assert f"MADDPG's one seed is above them all, {maddpg:.3f}" in page
+    told = f"{whole:.3f} whole, at {without2:.3f} without stage 2, where nobody hears anybody, and at **{without1:.3f}"
+    assert f"Seed 0 ends at {told} without stage 1" in page
 
 
 def test_a_run_that_is_shorter_than_its_cell_is_no_part_of_the_campaign(campaign, monkeypatch, tmp_path):
