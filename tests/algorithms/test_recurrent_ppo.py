@@ -17,15 +17,16 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 GRU = "algo.actor.memory={cell:gru,size:12}"
 CASES = pytest.mark.parametrize(
-    ("algo", "task", "model"),
+    "case",  # an algorithm, a task, a model, and further settings
     [
         ("softgm", "wall", "softgm"),
         ("mappo", "structured", "mlp"),
         ("ippo", "wall", "mlp"),
-        ("softgm algo.actor.mirror=average", "wall", "softgm"),
-        ("softgm algo.actor.mirror=canonical", "wall", "softgm"),
+        ("softgm", "wall", "softgm", "algo.actor.mirror=average"),
+        ("softgm", "wall", "softgm", "algo.actor.mirror=canonical"),
         ("ippo", "vmas_balance", "vector_mlp"),
     ],
+    ids="-".join,
 )
 
 
@@ -36,7 +37,7 @@ def build():
     def algorithm(algo="mappo", task="basic", model="mlp", *overrides):
         if task.startswith("vmas"):
             pytest.importorskip("vmas", reason="VMAS is an optional extra: pip install 'softgm-bench[vmas]'")
-        settings = [*f"algo={algo}".split(), f"task={task}", f"model={model}", "recipe=paper", "rod.n_elements=20", GRU]
+        settings = [f"algo={algo}", f"task={task}", f"model={model}", "recipe=paper", "rod.n_elements=20", GRU]
         config = configure([*settings, "algo.epochs=2", "algo.minibatch_size=16", *overrides])
         torch.manual_seed(0)
         env = build_env(config, 6, 0, 5, training=True)
@@ -53,8 +54,8 @@ def build():
 
 
 @CASES
-def test_collected_log_probabilities_are_those_of_the_sequence_with_resets_inside(build, algo, task, model):
-    learner, batches = build(algo, task, model)
+def test_collected_log_probabilities_are_those_of_the_sequence_with_resets_inside(build, case):
+    learner, batches = build(*case)
     for batch in (next(batches), next(batches)):
         assert batch["next", entries.DONE][:, :-1].any()
         frames = learner.prepare(batch)
@@ -68,8 +69,8 @@ def test_collected_log_probabilities_are_those_of_the_sequence_with_resets_insid
 
 
 @CASES
-def test_a_state_goes_from_step_to_step_and_a_new_episode_begins_without(build, algo, task, model):
-    learner, batches = build(algo, task, model)
+def test_a_state_goes_from_step_to_step_and_a_new_episode_begins_without(build, case):
+    learner, batches = build(*case)
     first, second = (next(batches).clone() for _ in range(2))
     batch = torch.cat([first, second], dim=1)
     assert torch.equal(batch[:, 1:][entries.MEMORY], batch[:, :-1][entries.NEXT_MEMORY])
