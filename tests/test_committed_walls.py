@@ -86,6 +86,9 @@ SENSING = {  # rows of the page: folders
     "SoftGM, seed 0, one step of contact": "trials/wall_sense/contact1_seed0",
     "SoftGM, seed 0, no contact, `mirror=average`": "trials/wall_sense/contact0_seed0_average",
     "SoftGM, seed 0, no contact, `easy_contact_steps=5`, `mirror=average`": "trials/wall_sense/eased0_seed0_average",
+    "SoftGM without stage 1, seed 0, no contact, `easy_contact_steps=5`, `mirror=average`": (
+        "trials/wall_sense/eased0_blind0_average"
+    ),
 }
 
 
@@ -202,9 +205,26 @@ def test_what_is_said_of_a_wall_that_may_not_be_touched_is_what_its_trials_hold(
     told = f"After {millions(still)} million frames its episodes last {np.mean(lengths[-10:]):.0f} of 60 steps, and"
     assert told in page
     eased = ROOT / "experiments" / SENSING["SoftGM, seed 0, no contact, `easy_contact_steps=5`, `mirror=average`"]
-    reached_then = float(rows(eased / "metrics.csv")[-1]["difficulty"])
-    told = f"had reached a difficulty of {reached_then:.1f} when the clock stopped it after {millions(eased)} million"
+    blind = eased.with_name("eased0_blind0_average")
+    final = json.loads((eased / "summary.json").read_text())["final_evaluation"]["success_rate"]
+    assert "not to touch: {mean:.3f} [{low:.3f}, {high:.3f}] of 1000 scenes after three".format(**final) in page
+    curve = script(ROOT / "experiments" / "trials.py").curve(eased)
+    assert (
+        f"({curve[6]:.2f} of 256 scenes), and from there on it learnt to go back and round ({curve[7]:.2f} after"
+        in page
+    )
+    shown = {name: found["success"] for name, found in results.episodes_in(eased / "evaluations").items()}
+    told = "500 scenes it has {none:.3f}, shown no obstacle {blind:.3f}, shown another scene's {swap_obstacles:.3f}."
+    assert told.format(**{name: success.mean() for name, success in shown.items()}) in page
+    alone = results.episodes_in(blind / "evaluations")["none"]["success"]
+    split = mcnemar(shown["none"], alone)
+    told = (
+        f"after {millions(blind)} million frames, has {alone.mean():.3f} of them ({split.lost} lost and {split.won} won"
+    )
     assert told in page
+    failures = json.loads((blind / "evaluations" / "none" / "summary.json").read_text())["metrics"]
+    crashed = failures["contact_failure"] / (1.0 - alone.mean()) / len(alone)
+    assert 0.3 < crashed < 0.35  # two of three are of something else
 
 
 @pytest.mark.parametrize("name", FELT)
