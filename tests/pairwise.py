@@ -5,6 +5,11 @@ from itertools import combinations, product
 import pytest
 
 
+def tiered(*values, quick, name=None):
+    """One parameter, or a row of them, of the quick tier or of `make test-all` alone."""
+    return pytest.param(*values, id=name, marks=() if quick else pytest.mark.slow)
+
+
 def pairs_of(row):
     return {(i, row[i], j, row[j]) for i, j in combinations(range(len(row)), 2)}
 
@@ -23,11 +28,11 @@ def pairwise(*factors, slow=()):
     """Parameters for the product of the factors; those outside of the cover or with a ``slow`` value are slow."""
     rows = list(product(*factors))
     quick = cover([row for row in rows if not set(row) & set(slow)])
-    return [pytest.param(*row, marks=() if row in quick else pytest.mark.slow) for row in rows]
+    return [tiered(*row, quick=row in quick) for row in rows]
 
 
 def partly(values, quick):
     """Parameters for the values, by the names of a mapping if it is one; those but the ``quick`` ones are slow."""
-    named = values.items() if isinstance(values, dict) else [(None, value) for value in values]
-    marks = [() if (value if name is None else name) in quick else pytest.mark.slow for name, value in named]
-    return [pytest.param(value, id=name, marks=mark) for (name, value), mark in zip(named, marks, strict=True)]
+    if isinstance(values, dict):
+        return [tiered(value, quick=name in quick, name=name) for name, value in values.items()]
+    return [tiered(value, quick=value in quick) for value in values]

@@ -8,6 +8,7 @@ import time
 
 import pytest
 
+from pairwise import tiered
 from softgm_bench.storage.run_folder import RunFolder
 
 TINY = [
@@ -49,12 +50,12 @@ MISTAKES = {
     "no override": (["wall"], "settings are written key=value"),
     "dashes": (["--seed=3"], "--seed=3: no such option; settings are written without dashes: seed=value"),
 }
-SLOW = ("misspelt key", "negative seed", "zero environments", "no override")  # they take the way out of another
+SLOW = ("misspelt key", "zero environments", "no override")  # they take the way out of another
 
 
 @pytest.mark.parametrize(
     ("arguments", "says"),
-    [pytest.param(*MISTAKES[name], id=name, marks=[pytest.mark.slow] * (name in SLOW)) for name in MISTAKES],
+    [tiered(*MISTAKES[name], quick=name not in SLOW, name=name) for name in MISTAKES],
 )
 def test_a_mistake_is_answered_by_one_line_and_leaves_nothing_behind(tmp_path, arguments, says):
     (tmp_path / "file").write_text("")
@@ -107,9 +108,9 @@ def test_a_sweep_runs_every_job_and_reports_each_that_fails(tmp_path):
     ("number", "code"),
     [
         (signal.SIGINT, 130),
-        pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow),
-        pytest.param(signal.SIGHUP, 129, marks=pytest.mark.slow),
-        pytest.param(signal.SIGUSR1, 138, marks=pytest.mark.slow),
+        tiered(signal.SIGTERM, 143, quick=False),
+        tiered(signal.SIGHUP, 129, quick=False),
+        tiered(signal.SIGUSR1, 138, quick=False),
     ],
 )
 def test_an_interrupted_run_says_where_its_checkpoint_is(tmp_path, number, code):

@@ -3,6 +3,7 @@ import torch
 from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type, step_mdp
 
 from every_task import TASKS
+from pairwise import partly
 from softgm_bench.envs import entries, make_env
 from softgm_bench.models.heads import build_actor
 from softgm_bench.rod.parameters import RodParameters
@@ -68,7 +69,7 @@ def test_the_torch_backend_makes_the_same_episodes(build):
 
 
 @pytest.mark.parametrize("n_agents", [1, 2, 4, 9])
-@pytest.mark.parametrize("n_elements", [pytest.param(11, marks=pytest.mark.slow), 20, 60])
+@pytest.mark.parametrize("n_elements", partly([11, 20, 60], [20, 60]))
 def test_agents_and_elements_are_parameters(build, n_agents, n_elements):
     rod = RodParameters(n_elements=n_elements, substeps=5)
     env = build("structured", overrides=(f"task.n_agents={n_agents}", "task.slots=5"), rod=rod)

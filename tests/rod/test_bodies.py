@@ -8,6 +8,7 @@ import pytest
 import torch
 from parity_cases import CASES, CPU_BACKENDS, FRICTION, OBLIQUE_BAR, QUANTITIES, WALL, Array, Case
 
+from pairwise import tiered
 from softgm_bench.rod.backend import make_backend
 from softgm_bench.rod.bodies import Bodies, Scales, draw, scales
 from softgm_bench.rod.parameters import DAMPING_PROTOCOLS, RodParameters, rod_constants
@@ -63,7 +64,7 @@ def ours(backend: str, name: str, count: int) -> dict[str, Array]:
     return {quantity: np.stack([getattr(state, quantity).numpy() for state in states]) for quantity in QUANTITIES}
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in TOUCHING else n for n in SCENES])
+@pytest.mark.parametrize("name", [tiered(name, quick=name not in TOUCHING) for name in SCENES])
 @pytest.mark.parametrize("backend", [*CPU_BACKENDS, "pyelastica"])
 def test_each_body_moves_as_its_own_arm_in_pyelastica(backend: str, name: str):
     count = 2 if backend == "torch" and name in TOUCHING else 3

@@ -15,6 +15,7 @@ from parity_cases import (
     together,
 )
 
+from pairwise import tiered
 from softgm_bench.rod.parameters import RodParameters
 from softgm_bench.rod.pyelastica_oracle import Array, History, simulate
 
@@ -38,11 +39,7 @@ def batch(backend: str, group: int) -> dict[str, dict[str, Array]]:
 # The quick tier has all that the kernel does with one number of elements, and one case, free and then touching, of the
 # backend that takes its time; tests of the kernel compare the two.
 SLOW = {"torch": set(CASES) - {"wall, friction"}, "numba": {"11 elements", "100 elements"}}
-EVERY = [
-    pytest.param(backend, name, marks=pytest.mark.slow) if name in SLOW[backend] else (backend, name)
-    for backend in CPU_BACKENDS
-    for name in CASES
-]
+EVERY = [tiered(backend, name, quick=name not in SLOW[backend]) for backend in CPU_BACKENDS for name in CASES]
 
 
 @pytest.mark.parametrize(("backend", "name"), EVERY)

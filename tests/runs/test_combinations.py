@@ -10,7 +10,7 @@ import torch
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import every_task
-from pairwise import pairwise
+from pairwise import pairwise, tiered
 from softgm_bench.algorithms import algorithm_configs, build_algorithm
 from softgm_bench.config import compose
 from softgm_bench.envs import entries, make_env
@@ -91,7 +91,7 @@ def test_algorithms_of_every_kind_train_on_walls_that_have_to_be_felt(tmp_path, 
 
 @pytest.mark.parametrize(
     ("model", "task"),
-    [pytest.param(*row, marks=() if row[1] == "wall" else pytest.mark.slow) for row in product(ABLATIONS, TASKS)],
+    [tiered(*row, quick=row[1] == "wall") for row in product(ABLATIONS, TASKS)],
 )
 def test_ablations_train_on_every_task_under_their_own_names(tmp_path, model, task):
     summary = check_run(tmp_path, "softgm", f"task={task}", f"model={model}")
