@@ -34,6 +34,7 @@ def random_step(dtype: torch.dtype, num_envs: int) -> Step:
         action=draw(4, 2),
         previous_action=draw(4, 2),
         touching=draw(5) > draw(1) + 0.7,
+        pushed=draw() > 0.8,
         new_bins=(5.0 * draw()).clamp(min=0.0).long(),
         broken=draw() > 0.8,
         terminated=draw() > 0.8,

@@ -15,6 +15,7 @@ NEUTRAL: dict[str, Any] = {
     "task.train_horizon": None,
     "task.hidden_scene": False,
     "task.max_contact_steps": None,
+    "task.contact_counts": "at_end",
     "task.friction_coefficient": None,
     "task.velocity_damping_coefficient": None,
     "task.reward.lambda_fail": 0.0,

@@ -84,8 +84,8 @@ def make_judge(n_nodes: int, n_agents: int, real: type) -> Callable[..., Any]:
     """
 
     def kernel(
-        before, after, target, action, previous_action, touching, new_bins, broken, terminated, truncated, steps,
-        contact_steps, numbers, flags, clocks, c, horizon, limit,
+        before, after, target, action, previous_action, touching, pushed, new_bins, broken, terminated, truncated,
+        steps, contact_steps, numbers, flags, clocks, c, horizon, limit,
     ):  # fmt: skip
         b = cuda.blockIdx.x * cuda.blockDim.x + cuda.threadIdx.x
         if b < steps.shape[0]:
@@ -95,7 +95,7 @@ def make_judge(n_nodes: int, n_agents: int, real: type) -> Callable[..., Any]:
             for k in range(n_nodes):
                 contacts += 1 if touching[b, k] else 0
             clocks[0, b] = steps[b] + (1 if active else 0)
-            clocks[1, b] = contact_steps[b] + (1 if active and contacts > 0 else 0)
+            clocks[1, b] = contact_steps[b] + (1 if active and (contacts > 0 or pushed[b]) else 0)
             failure = active and limit >= 0 and clocks[1, b] > limit
             success = distance < c.success_radius and not broken[b] and not failure
             over = terminated[b] or (active and (success or broken[b] or failure))

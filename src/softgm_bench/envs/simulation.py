@@ -45,7 +45,7 @@ class Episodes(TensorClass):
             slots where nothing moves.
         previous_action: as the sections applied it, ``(num_envs, n_agents, 2)`` float32; 0 after a reset.
         steps: control steps since the reset, ``(num_envs,)`` int64.
-        contact_steps: those of them that ended in contact, where the task limits them, ``(num_envs,)`` int64; counted
+        contact_steps: those of them that were in contact, where the task limits them, ``(num_envs,)`` int64; counted
             from below 0 where an easier scene allows more.
         terminated: success, divergence or too much contact, ``(num_envs,)`` bool.
         truncated: the horizon, ``(num_envs,)`` bool.
@@ -155,6 +155,8 @@ class Simulator:
         self._rest_length = torch.as_tensor(constants.rest_length, dtype=dtype, device=device)
         self._volume = torch.as_tensor(constants.volume, dtype=dtype, device=device)
         self._n_bins = task.max_cylinders * bins_per_cylinder(task.max_cylinder_length, config.bin_length)
+        self._counts_pushes = config.max_contact_steps is not None and config.contact_counts == "within"
+        self._unpushed = torch.zeros(num_envs, dtype=torch.bool, device=device)
         self._generator = torch.Generator(device=device)
         self.randomise = None if randomise is None or randomise.nothing else randomise
         self._body_generator = torch.Generator(device=device)
@@ -357,8 +359,16 @@ class Simulator:
         bodies = self._bodies(now)
         if bodies is not None:
             couple = couple * self._strength(now).to(self.dtype)[:, None, None]
+        pushed = torch.zeros_like(active) if self._counts_pushes else self._unpushed
         moved = self.backend.control_step(
-            rod, couple, force=force, cylinders=cylinders, active=active, cylinder_velocity=velocity, bodies=bodies
+            rod,
+            couple,
+            force=force,
+            cylinders=cylinders,
+            active=active,
+            cylinder_velocity=velocity,
+            bodies=bodies,
+            touched=pushed if self._counts_pushes else None,
         )
         broken = diverged(moved, self._rest_length, config.min_dilatation, config.max_dilatation)
         if sync.any_true(broken):
@@ -373,6 +383,7 @@ class Simulator:
             action=action,
             previous_action=previous_action,
             touching=self.contacts(now),
+            pushed=pushed,
             new_bins=sight.new,
             broken=broken,
             terminated=now.terminated,

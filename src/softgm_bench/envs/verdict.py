@@ -24,13 +24,14 @@ class Step(NamedTuple):
         target: m, ``(.., 3)``.
         action: as the sections applied it, ``(.., n_agents, 2)``.
         previous_action: that of the step before.
-        touching: nodes in contact, ``(.., n_nodes)`` bool.
+        touching: nodes in contact after the step, ``(.., n_nodes)`` bool.
+        pushed: whether an obstacle pushed the arm within the step, where that counts as contact, bool; else False.
         new_bins: discovered in this step, int64.
         broken: whether the simulation broke, bool.
         terminated: before the step, bool.
         truncated: before the step, bool.
         steps: before the step, int64.
-        contact_steps: steps of the episode so far that ended in contact, int64.
+        contact_steps: steps of the episode so far that were in contact, int64.
     """
 
     before: Tensor
@@ -39,6 +40,7 @@ class Step(NamedTuple):
     action: Tensor
     previous_action: Tensor
     touching: Tensor
+    pushed: Tensor
     new_bins: Tensor
     broken: Tensor
     terminated: Tensor
@@ -115,7 +117,7 @@ def judge_dense(step: Step, config: TaskConfig, horizon: int) -> Verdict:
     touching = step.touching.sum(dim=-1)
     contact_steps, too_much, ends = step.contact_steps, None, step.broken
     if config.max_contact_steps is not None:
-        contact_steps = contact_steps + (active & (touching > 0))
+        contact_steps = contact_steps + (active & ((touching > 0) | step.pushed))
         too_much = active & (contact_steps > config.max_contact_steps)
         success, ends = success & ~too_much, ends | too_much
     terminated = step.terminated | (active & (success | ends))

@@ -26,7 +26,15 @@ from softgm_bench.storage.files import write_where_asked
 FOLDER = Path(__file__).with_suffix("")
 LEVELS = 127  # of an action's component on either side of 0: sequences are stored in one byte a number
 # What decides, beside the arm, whether a sequence of actions succeeds in a scene.
-DECISIVE = ("n_agents", "success_radius", "min_dilatation", "max_dilatation", "max_contact_steps", "actuation")
+DECISIVE = (
+    "n_agents",
+    "success_radius",
+    "min_dilatation",
+    "max_dilatation",
+    "max_contact_steps",
+    "contact_counts",
+    "actuation",
+)
 
 Array = NDArray[Any]
 

@@ -32,6 +32,7 @@ class Backend(Protocol):
         substeps: int | None = None,
         cylinder_velocity: Tensor | None = None,
         bodies: Bodies | None = None,
+        touched: Tensor | None = None,
     ) -> RodState:
         """Advance every active rod by one control step and return a new state."""
         ...

@@ -40,6 +40,7 @@ class CudaBackend:
         substeps: int | None = None,
         cylinder_velocity: Tensor | None = None,
         bodies: Bodies | None = None,
+        touched: Tensor | None = None,
     ) -> RodState:
         """Advance every rod by one control step.
 
@@ -53,6 +54,8 @@ class CudaBackend:
             cylinder_velocity: with which the cylinders move on from where they are now, m/s, without turning,
                 ``(num_envs, n_cylinders, 3)``; constant in the step. By default they stand still.
             bodies: factors on the parameters, an arm for each environment; by default all are the nominal one.
+            touched: ``(num_envs,)`` bool, in which rods that a cylinder pushes in any substep are marked; entries of
+                others stay as they are. By default nobody is told.
 
         Returns:
             A new state.
@@ -61,7 +64,7 @@ class CudaBackend:
             ValueError: if the arguments' shapes do not fit together, a tensor is not where the state is, or a gradient
                 is asked for.
         """
-        check_inputs(self.parameters, state, couple, force, cylinders, active, cylinder_velocity, bodies)
+        check_inputs(self.parameters, state, couple, force, cylinders, active, cylinder_velocity, bodies, touched)
         refuse_gradients("cuda", state, couple, force, bodies)
         device, dtype = state.position.device, state.position.dtype
         _check_device(
@@ -71,6 +74,7 @@ class CudaBackend:
             active=active,
             cylinders=cylinders,
             cylinder_velocity=cylinder_velocity,
+            touched=touched,
             **({} if bodies is None else {f"bodies.{name}": factor for name, factor in bodies._asdict().items()}),
         )
         if dtype not in REAL:
@@ -94,11 +98,12 @@ class CudaBackend:
             columns = scratch_columns(self.parameters.n_elements, REAL[dtype])
             scratch = torch.empty((len(couple), ROWS, columns), dtype=dtype, device=device) if columns else nothing
             flags = never[0] if active is None else active.bool().contiguous()
+            marks = torch.empty(len(couple), dtype=torch.bool, device=device) if touched is None else touched
             launch(
                 make_step(self.parameters.n_elements, REAL[dtype], contact, moving, bodies is not None),
                 len(couple),
                 self.parameters.n_nodes,
-                [*old, *new, couple, force_or_nothing, flags, *obstacles, scratch],
+                [*old, *new, couple, force_or_nothing, flags, *obstacles, marks, scratch],
                 int(force is not None),
                 int(active is not None),
                 self._coefficients[REAL[dtype]] if bodies is None else self._rows(bodies, dtype),

@@ -42,7 +42,7 @@ def make_press(n_elements: int, real: type, contact_model: str, moving: bool) ->
 
     def press(
         c, k, x, y, z, nx, ny, nz, vx, vy, vz, wx, wy, wz, current, duration, travelled, next_check, candidates,
-        b, start, axis, length, radius, mask, velocities, substep, substeps,
+        b, start, axis, length, radius, mask, velocities, touched, substep, substeps,
     ):  # fmt: skip
         """Force of the cylinders on the two nodes of an element, and what is kept between substeps.
 
@@ -61,6 +61,7 @@ def make_press(n_elements: int, real: type, contact_model: str, moving: bool) ->
             b: environment.
             start, axis, length, radius, mask: of all environments' cylinders as the control step begins.
             velocities: their velocities, ``(num_envs, n_cylinders, 3)``; never read where cylinders stand still.
+            touched: where a rod that a cylinder pushes is marked, ``(num_envs,)``.
             substep, substeps: which one of the control step this is, from 0, and of how many.
         """
         ux, uy, uz = vx + wx, vy + wy, vz + wz
@@ -86,7 +87,7 @@ def make_press(n_elements: int, real: type, contact_model: str, moving: bool) ->
             if mask[b, i]:
                 fx, fy, fz, gx, gy, gz = touch(
                     c, k, x, y, z, nx, ny, nz, vx, vy, vz, wx, wy, wz, own_radius, b, i, start, axis, length, radius,
-                    velocities, substep,
+                    velocities, touched, substep,
                 )  # fmt: skip
                 px, py, pz, qx, qy, qz = px - fx, py - fy, pz - fz, qx - gx, qy - gy, qz - gz
         return px, py, pz, qx, qy, qz, travelled, next_check, candidates
@@ -101,7 +102,7 @@ def make_no_press(real: type) -> Callable[..., Any]:
 
     def press(
         c, k, x, y, z, nx, ny, nz, vx, vy, vz, wx, wy, wz, current, duration, travelled, next_check, candidates,
-        b, start, axis, length, radius, mask, velocities, substep, substeps,
+        b, start, axis, length, radius, mask, velocities, touched, substep, substeps,
     ):  # fmt: skip
         return zero, zero, zero, zero, zero, zero, travelled, next_check, candidates
 
@@ -183,7 +184,7 @@ def _make_touch(n_elements: int, real: type, contact_model: str, moving: bool) -
 
     def touch(
         c, k, x, y, z, nx, ny, nz, vx, vy, vz, wx, wy, wz, own_radius, b, i, start, axis, length, radius,
-        velocities, substep,
+        velocities, touched, substep,
     ):  # fmt: skip
         """Forces with which the two nodes of an element push cylinder ``i``."""
         extent = length[b, i]
@@ -196,6 +197,7 @@ def _make_touch(n_elements: int, real: type, contact_model: str, moving: bool) -
         touching, found = meet(x, y, z, nx, ny, nz, own_radius, cylinder)
         if not touching:
             return zero, zero, zero, zero, zero, zero
+        touched[b] = True  # by as many threads as there are elements that touch, all of them the same
         vx, wx = relative(vx, velocities, b, i, 0), relative(wx, velocities, b, i, 0)
         vy, wy = relative(vy, velocities, b, i, 1), relative(wy, velocities, b, i, 1)
         vz, wz = relative(vz, velocities, b, i, 2), relative(wz, velocities, b, i, 2)

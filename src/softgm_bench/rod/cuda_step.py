@@ -36,7 +36,8 @@ def make_step(
 
     Launch with a block for each rod and ``n_elements + 1`` threads. Arguments: the state's four arrays, the four that
     receive the new state, couple, force, active, the cylinders' five arrays (never read without a contact model) and
-    their velocities (never read unless they are moving), scratch (see ``scratch_columns``), whether (1 or 0) force and
+    their velocities (never read unless they are moving), where rods that they push are marked (never written without a
+    contact model), scratch (see ``scratch_columns``), whether (1 or 0) force and
     active are given, ``Coefficients`` (of ``drawn`` bodies a row of them for each rod, ``(num_envs, 27)``), the
     substeps.
     """
@@ -50,8 +51,8 @@ def make_step(
 
     def step(
         position, director, velocity, omega, new_position, new_director, new_velocity, new_omega,
-        couple, force, active, start, axis, length, radius, mask, velocities, scratch, with_force, with_active, given,
-        substeps,
+        couple, force, active, start, axis, length, radius, mask, velocities, touched, scratch, with_force,
+        with_active, given, substeps,
     ):  # fmt: skip
         b, k = cuda.blockIdx.x, cuda.threadIdx.x
         c = own(given, b)
@@ -77,7 +78,7 @@ def make_step(
                 fx, fy, fz, m0, m1, m2, k0, k1, k2, current, travelled, next_check, candidates = act(
                     c, node, joint, k, x, y, z, vx, vy, vz, q00, q01, q02, q10, q11, q12, q20, q21, q22, w0, w1, w2,
                     duration, travelled, next_check, candidates, b, start, axis, length, radius, mask, velocities,
-                    substep, substeps,
+                    touched, substep, substeps,
                 )  # fmt: skip
                 cuda.syncthreads()
                 vx, vy, vz, w0, w1, w2 = accelerate(
@@ -207,7 +208,7 @@ def _make_act(n: int, real: type, contact: str | None, moving: bool) -> Callable
 
     def act(
         c, node, joint, k, x, y, z, vx, vy, vz, q00, q01, q02, q10, q11, q12, q20, q21, q22, w0, w1, w2,
-        duration, travelled, next_check, candidates, b, start, axis, length, radius, mask, velocities,
+        duration, travelled, next_check, candidates, b, start, axis, length, radius, mask, velocities, touched,
         substep, substeps,
     ):  # fmt: skip
         """Forces, torques and curvature of element k; ``joint`` receives what its neighbours need.
@@ -232,7 +233,7 @@ def _make_act(n: int, real: type, contact: str | None, moving: bool) -> Callable
                 )  # fmt: skip
             px, py, pz, qx, qy, qz, travelled, next_check, candidates = press(
                 c, k, x, y, z, nx, ny, nz, vx, vy, vz, wx, wy, wz, current, duration, travelled, next_check, candidates,
-                b, start, axis, length, radius, mask, velocities, substep, substeps,
+                b, start, axis, length, radius, mask, velocities, touched, substep, substeps,
             )  # fmt: skip
             outer_x, outer_y, outer_z = qx - fx, qy - fy, qz - fz
             fx, fy, fz = fx + px, fy + py, fz + pz

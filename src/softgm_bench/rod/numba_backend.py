@@ -57,6 +57,7 @@ class NumbaBackend:
         substeps: int | None = None,
         cylinder_velocity: Tensor | None = None,
         bodies: Bodies | None = None,
+        touched: Tensor | None = None,
     ) -> RodState:
         """Advance every rod by one control step.
 
@@ -70,6 +71,8 @@ class NumbaBackend:
             cylinder_velocity: with which the cylinders move on from where they are now, m/s, without turning,
                 ``(num_envs, n_cylinders, 3)``; constant in the step. By default they stand still.
             bodies: factors on the parameters, an arm for each environment; by default all are the nominal one.
+            touched: ``(num_envs,)`` bool, in which rods that a cylinder pushes in any substep are marked; entries of
+                others stay as they are. By default nobody is told.
 
         Returns:
             A new state.
@@ -77,7 +80,7 @@ class NumbaBackend:
         Raises:
             ValueError: if the arguments' shapes do not fit together, or a gradient is asked for.
         """
-        check_inputs(self.parameters, state, couple, force, cylinders, active, cylinder_velocity, bodies)
+        check_inputs(self.parameters, state, couple, force, cylinders, active, cylinder_velocity, bodies, touched)
         forks.check()
         refuse_gradients("numba", state, couple, force, bodies)
         dtype = state.position.dtype
@@ -92,6 +95,8 @@ class NumbaBackend:
         table = _cylinder_table(cylinders, cylinder_velocity, num_envs, dtype)
         if active is None:
             active = torch.ones(num_envs, dtype=torch.bool)
+        if touched is None:
+            touched = torch.empty(num_envs, dtype=torch.bool)
         moving = cylinder_velocity is not None
         step = _make_step(n, arrays[0].dtype.type, self.parameters.contact_model, moving, bodies is not None)
         step(
@@ -100,6 +105,7 @@ class NumbaBackend:
             total_force.numpy(),
             table.numpy(),
             active.contiguous().numpy(),
+            touched.numpy(),
             rows,
             *(shared if scaled is None else _each(scaled.to(dtype).numpy(), *shared)),
             self.parameters.substeps if substeps is None else substeps,
@@ -163,7 +169,7 @@ def _make_step(n_elements: int, dtype: type, contact_model: str, moving: bool, d
     single = dtype is np.float32
 
     def control_step(
-        position, director, velocity, omega, couple, force, cylinders, active, rows, scalars, contact, substeps
+        position, director, velocity, omega, couple, force, cylinders, active, touched, rows, scalars, contact, substeps
     ):
         for b in numba.prange(position.shape[0]):
             if active[b]:
@@ -172,14 +178,15 @@ def _make_step(n_elements: int, dtype: type, contact_model: str, moving: bool, d
                 s = memory[skip : skip + layout.size]
                 fill(s, rows)
                 load(s, position[b], director[b], velocity[b], omega[b], couple[b], force[b])
-                advance(s, cylinders[b], scalars, contact, substeps)
+                touched[b] |= advance(s, cylinders[b], scalars, contact, substeps)
                 if single:
                     straighten(s)
                 store(s, position[b], director[b], velocity[b], omega[b])
 
     def control_step_of_bodies(
-        position, director, velocity, omega, couple, force, cylinders, active, rows, scales, scalars, contact, substeps
-    ):
+        position, director, velocity, omega, couple, force, cylinders, active, touched, rows, scales, scalars, contact,
+        substeps,
+    ):  # fmt: skip
         for b in numba.prange(position.shape[0]):
             if active[b]:
                 memory = np.empty(layout.size + width, rows.dtype)
@@ -188,7 +195,7 @@ def _make_step(n_elements: int, dtype: type, contact_model: str, moving: bool, d
                 fill(s, rows)
                 shape(s, scales[b])
                 load(s, position[b], director[b], velocity[b], omega[b], couple[b], force[b])
-                advance(s, cylinders[b], scalars[b], contact[b], substeps)
+                touched[b] |= advance(s, cylinders[b], scalars[b], contact[b], substeps)
                 if single:
                     straighten(s)
                 store(s, position[b], director[b], velocity[b], omega[b])
@@ -213,7 +220,7 @@ def _make_advance(layout: Layout, real: type, contact_model: str, moving: bool) 
 
     def advance(s, cylinders, scalars, contact, substeps):
         dt, decay, volume = scalars[0], scalars[1], scalars[2]
-        touched, soonest = False, -far
+        touched, copied, soonest = False, False, -far
         fastest = zero
         for k in range(n + 1):
             fastest = larger(fastest, s[p.vx + k] ** 2 + s[p.vy + k] ** 2 + s[p.vz + k] ** 2)
@@ -225,17 +232,17 @@ def _make_advance(layout: Layout, real: type, contact_model: str, moving: bool) 
             stresses(s)
             couples(s)
             if cylinders.shape[0] > 0:
-                touching = False
+                copied_before, copied = copied, False
                 extent = reach(s, volume)
                 if travelled + extent > soonest:
                     carry(cylinders, substep, dt)
-                    touching, soonest = add_contact(s, cylinders, travelled, extent, contact, volume)
-                if touched and not touching:
+                    copied, pushed, soonest = add_contact(s, cylinders, travelled, extent, contact, volume)
+                    touched |= pushed
+                if copied_before and not copied:
                     for k in range(n + 1):
                         s[p.fx + k] = s[p.gx + k]
                         s[p.fy + k] = s[p.gy + k]
                         s[p.fz + k] = s[p.gz + k]
-                touched = touching
             spin(s)
             fastest = push(s, decay)
             # the half steps that end this substep and begin the next one are one
@@ -243,6 +250,7 @@ def _make_advance(layout: Layout, real: type, contact_model: str, moving: bool) 
             travelled += step * (np.sqrt(fastest) + drift)
             rotate(s, step)
             move(s, step)
+        return touched
 
     callees = make_contact(layout, real, touch)._asdict() | make_kernel(n, real)._asdict()
     return jit(advance, **callees, speed=motion.speed, carry=motion.carry)

@@ -50,9 +50,9 @@ def make_contact(layout: Layout, real: type, touch: Callable[..., Any]) -> Conta
             volume: largest element volume, m^3.
 
         Returns:
-            Whether contact was added, and how far the rod must travel until any cylinder is due.
+            Whether forces were written anew, whether a cylinder pushes, how far the rod must travel until one is due.
         """
-        copied, soonest = False, never
+        copied, pushed, soonest = False, False, never
         for c in range(cylinders.shape[0]):
             cylinder = cylinders[c]
             if cylinder[NEXT_CHECK] < travelled + extent:
@@ -67,10 +67,10 @@ def make_contact(layout: Layout, real: type, touch: Callable[..., Any]) -> Conta
                             s[p.fz + k] = s[p.gz + k]
                     limit = (extent + cylinder[RADIUS]) ** 2
                     for k in range(n):
-                        if s[p.distance2 + k] <= limit:
-                            touch(s, k, cylinder, contact, volume)
+                        if s[p.distance2 + k] <= limit and touch(s, k, cylinder, contact, volume):
+                            pushed = True
             soonest = min(soonest, cylinder[NEXT_CHECK])
-        return copied, soonest
+        return copied, pushed, soonest
 
     return Contact(
         reach=_make_reach(p, real),
@@ -163,7 +163,7 @@ def make_touch(layout: Layout, real: type, contact_model: str, moving: bool) -> 
     inverse_pi = real(1.0 / np.pi)
 
     def touch(s, k, cylinder, contact, volume):
-        """Add the cylinder's force to the element's two nodes; arguments as those of ``add_contact``."""
+        """Add the cylinder's force, if any, to the element's two nodes and say so; arguments as in ``add_contact``."""
         touching, found = meet(
             s[p.px + k],
             s[p.py + k],
@@ -175,7 +175,7 @@ def make_touch(layout: Layout, real: type, contact_model: str, moving: bool) -> 
             cylinder,
         )
         if not touching:
-            return
+            return False
         vx, vy, vz = s[p.vx + k], s[p.vy + k], s[p.vz + k]
         wx, wy, wz = s[p.vx + k + 1], s[p.vy + k + 1], s[p.vz + k + 1]
         if moving:  # known when this is compiled
@@ -189,6 +189,7 @@ def make_touch(layout: Layout, real: type, contact_model: str, moving: bool) -> 
         s[p.fx + k + 1] -= gx
         s[p.fy + k + 1] -= gy
         s[p.fz + k + 1] -= gz
+        return True
 
     return jit(touch, **make_pair(contact_model, layout.n, real, jit)._asdict())
 

@@ -58,6 +58,7 @@ class PyElasticaBackend:
         substeps: int | None = None,
         cylinder_velocity: Tensor | None = None,
         bodies: Bodies | None = None,
+        touched: Tensor | None = None,
     ) -> RodState:
         """Advance every rod by one control step.
 
@@ -75,6 +76,8 @@ class PyElasticaBackend:
             cylinder_velocity: with which the cylinders move on from where they are now, m/s, without turning,
                 ``(num_envs, n_cylinders, 3)``; constant in the step. By default they stand still.
             bodies: factors on the parameters, an arm for each environment; by default all are the nominal one.
+            touched: ``(num_envs,)`` bool, in which rods that a cylinder pushes in any substep are marked; entries of
+                others stay as they are. By default nobody is told.
 
         Returns:
             A new state.
@@ -83,7 +86,7 @@ class PyElasticaBackend:
             ValueError: if the arguments' shapes do not fit together, the state is not float64 on the CPU, or a gradient
                 is asked for.
         """
-        check_inputs(self.parameters, state, couple, force, cylinders, active, cylinder_velocity, bodies)
+        check_inputs(self.parameters, state, couple, force, cylinders, active, cylinder_velocity, bodies, touched)
         refuse_gradients("pyelastica", state, couple, force, bodies)
         if state.position.dtype != torch.float64 or state.position.device.type != "cpu":
             raise ValueError(
@@ -117,6 +120,8 @@ class PyElasticaBackend:
                 for theirs, ours in zip(arm.state, fields, strict=True):
                     ours[...] = theirs
         self.missed += watched.missed
+        if touched is not None:
+            touched |= self.contact_force > 0.0
         return new
 
 

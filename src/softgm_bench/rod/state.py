@@ -107,6 +107,7 @@ def check_inputs(
     active: Tensor | None,
     cylinder_velocity: Tensor | None = None,
     bodies: Bodies | None = None,
+    touched: Tensor | None = None,
 ) -> None:
     """Refuse arguments that do not fit together before any kernel reads them.
 
@@ -125,6 +126,7 @@ def check_inputs(
         "couple": (couple, (num_envs, 3, n)),
         "force": (force, (num_envs, 3, n + 1)),
         "active": (active, (num_envs,)),
+        "touched": (touched, (num_envs,)),
         "cylinders.mask": (None if cylinders is None else cylinders.mask, (num_envs, -1)),
         "cylinder_velocity": (cylinder_velocity, (num_envs, n_cylinders, 3)),
     }

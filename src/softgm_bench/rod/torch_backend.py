@@ -55,14 +55,19 @@ class Geometry(NamedTuple):
 
 
 class Obstacles(NamedTuple):
-    """These are the cylinders as a control step begins and, where they move, their constant velocity in it, m/s."""
+    """These are the cylinders as a control step begins and, where they move, their constant velocity in it, m/s.
+
+    Where it is asked for, ``touched``, ``(num_envs,)`` bool, takes down which rods they push.
+    """
 
     cylinders: Cylinders
     velocity: Tensor | None
+    touched: Tensor | None
 
     def of(self, rows: Tensor) -> "Obstacles":
         """Select environments."""
-        return Obstacles(self.cylinders[rows], None if self.velocity is None else self.velocity[rows])
+        velocity, touched = (None if value is None else value[rows] for value in (self.velocity, self.touched))
+        return Obstacles(self.cylinders[rows], velocity, touched)
 
     def at(self, time: float) -> Cylinders:
         """Give the cylinders ``time`` s into the step."""
@@ -109,6 +114,7 @@ class TorchBackend:
         substeps: int | None = None,
         cylinder_velocity: Tensor | None = None,
         bodies: Bodies | None = None,
+        touched: Tensor | None = None,
     ) -> RodState:
         """Advance by one control step, with loads held constant.
 
@@ -122,6 +128,8 @@ class TorchBackend:
             cylinder_velocity: with which the cylinders move on from where they are now, m/s, without turning,
                 ``(num_envs, n_cylinders, 3)``; constant in the step. By default they stand still.
             bodies: factors on the parameters, an arm for each environment; by default all are the nominal one.
+            touched: ``(num_envs,)`` bool, in which rods that a cylinder pushes in any substep are marked; entries of
+                others stay as they are. By default nobody is told.
 
         Returns:
             A new state.
@@ -129,23 +137,26 @@ class TorchBackend:
         Raises:
             ValueError: if the arguments' shapes do not fit together.
         """
-        check_inputs(self.parameters, state, couple, force, cylinders, active, cylinder_velocity, bodies)
+        check_inputs(self.parameters, state, couple, force, cylinders, active, cylinder_velocity, bodies, touched)
         motion = Motion(state.position, state.director, state.velocity, state.omega)
-        obstacles = _obstacles(cylinders, cylinder_velocity)
+        obstacles = _obstacles(cylinders, cylinder_velocity, touched)
         if active is None:
             moved = self._advance(motion, couple, force, obstacles, substeps, bodies)
         else:
             # Resting environments aren't computed at all: one that has diverged can't poison gradients.
             chosen = active.nonzero().squeeze(-1)
+            met = None if obstacles is None else obstacles.of(chosen)
             moved = self._advance(
                 Motion(*(old[chosen] for old in motion)),
                 couple[chosen],
                 None if force is None else force[chosen],
-                None if obstacles is None else obstacles.of(chosen),
+                met,
                 substeps,
                 None if bodies is None else bodies.of(chosen),
             )
             moved = Motion(*(old.index_put((chosen,), new) for old, new in zip(motion, moved, strict=True)))
+            if touched is not None and met is not None and met.touched is not None:
+                touched[chosen] = met.touched
         return RodState(**moved._asdict(), batch_size=state.batch_size)
 
     def _advance(
@@ -173,9 +184,10 @@ class TorchBackend:
             constants = self._constants_of(bodies, motion.position)
             for substep in range(begun, end):
                 # contact acts in the middle of a substep
-                cylinders = None if obstacles is None else obstacles.at((substep + 0.5) * self.parameters.dt)
-                velocity = None if obstacles is None else obstacles.velocity
-                motion = self._substep(motion, constants, couple, force, cylinders, velocity)
+                now = None
+                if obstacles is not None:
+                    now = obstacles._replace(cylinders=obstacles.at((substep + 0.5) * self.parameters.dt))
+                motion = self._substep(motion, constants, couple, force, now)
             return motion
 
         substeps = self.parameters.substeps if substeps is None else substeps
@@ -195,8 +207,7 @@ class TorchBackend:
         constants: SimpleNamespace,
         couple: Tensor,
         external_force: Tensor,
-        cylinders: Cylinders | None,
-        cylinder_velocity: Tensor | None,
+        obstacles: Obstacles | None,
     ) -> Motion:
         """One position-Verlet step in the order of PyElastica's ``SymplecticStepperMixin.step``."""
         dt = self.parameters.dt
@@ -205,11 +216,14 @@ class TorchBackend:
         now = geometry(motion.position, constants)
         stress = internal_stress(motion.director, now, constants)
         force = internal_forces(motion.director, stress, now) + external_force
-        if cylinders is not None:
+        if obstacles is not None:
             radius = element_radius(motion.position, constants.volume)
-            contact = _CONTACT_FORCES[self.parameters.contact_model]
-            given = (radius, cylinders, self.parameters, cylinder_velocity, constants.friction)
-            force = force + contact(motion.position, motion.velocity, *given)
+            contact_forces_of = _CONTACT_FORCES[self.parameters.contact_model]
+            given = (radius, obstacles.cylinders, self.parameters, obstacles.velocity, constants.friction)
+            contact = contact_forces_of(motion.position, motion.velocity, *given)
+            force = force + contact
+            if obstacles.touched is not None:
+                obstacles.touched.logical_or_((contact != 0.0).flatten(1).any(1))
         torque = internal_torques(motion, stress, now, constants) + couple
 
         motion = dynamic_step(motion, force, torque, now.dilatation, constants, dt)
@@ -258,11 +272,11 @@ class TorchBackend:
         return self._tensors[key]
 
 
-def _obstacles(cylinders: Cylinders | None, velocity: Tensor | None) -> Obstacles | None:
+def _obstacles(cylinders: Cylinders | None, velocity: Tensor | None, touched: Tensor | None) -> Obstacles | None:
     if cylinders is None or velocity is None:
-        return None if cylinders is None else Obstacles(cylinders, None)
+        return None if cylinders is None else Obstacles(cylinders, None, touched)
     # what a masked cylinder holds may be anything, and a NaN in a discarded branch still poisons gradients
-    return Obstacles(cylinders, torch.where(cylinders.mask[..., None], velocity, 0.0))
+    return Obstacles(cylinders, torch.where(cylinders.mask[..., None], velocity, 0.0), touched)
 
 
 def _recomputed(
@@ -276,7 +290,7 @@ def _recomputed(
     """``segment`` of the other arguments with gradients for each of them, through ``Recomputed``."""
     shapes: tuple[Tensor, ...] = ()
     if obstacles is not None:
-        cylinders, velocity = obstacles
+        cylinders, velocity, _ = obstacles
         shapes = (cylinders.start, cylinders.axis, cylinders.length, cylinders.radius)
         shapes += () if velocity is None else (velocity,)
 
@@ -285,7 +299,8 @@ def _recomputed(
         given, factors = inputs[6 : 6 + len(shapes)], inputs[6 + len(shapes) :]
         if obstacles is not None:
             mask, size = obstacles.cylinders.mask, obstacles.cylinders.batch_size
-            seen = Obstacles(Cylinders(*given[:4], mask=mask, batch_size=size), given[4] if len(given) > 4 else None)
+            own = Cylinders(*given[:4], mask=mask, batch_size=size)
+            seen = Obstacles(own, given[4] if len(given) > 4 else None, obstacles.touched)
         motion = Motion(position, director, moving, omega)
         return segment(motion, couple, force, seen, Bodies(*factors) if factors else None)
 

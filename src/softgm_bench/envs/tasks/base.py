@@ -20,6 +20,8 @@ POOL = 4096  # fewest values among which admissible ones are looked for where no
 Range = tuple[float, float]
 Bounds = Sequence[float | Tensor]  # of two: numbers, or tensors without dimensions
 
+CONTACT_COUNTS = ("at_end", "within")  # of a control step, see ``conf/task``
+
 
 @dataclass
 class RewardConfig:
@@ -99,6 +101,7 @@ class TaskConfig:
     train_horizon: int | None
     hidden_scene: bool
     max_contact_steps: int | None
+    contact_counts: str
     friction_coefficient: float | None
     velocity_damping_coefficient: float | None
     actuation: ActuationConfig
@@ -119,6 +122,11 @@ class TaskConfig:
             raise ValueError(f"task.train_horizon is {self.train_horizon}: it must be at least 1, or null")
         if self.max_contact_steps is not None and self.max_contact_steps < 0:
             raise ValueError(f"task.max_contact_steps is {self.max_contact_steps}: it must be at least 0, or null")
+        if self.contact_counts not in CONTACT_COUNTS:
+            raise ValueError(
+                f"task.contact_counts is {self.contact_counts!r}: it must be {' or '.join(CONTACT_COUNTS)}, "
+                "where a step counts as one in contact"
+            )
         own, easy = self.max_contact_steps, self.curriculum.easy_contact_steps
         if easy is not None and (own is None or easy < own):
             raise ValueError(
