@@ -9,6 +9,7 @@ target, which tells nothing on this task, but told all of it in the first stages
 
 import json
 import sys
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from torch import Tensor
@@ -70,10 +71,10 @@ def play(trained: TrainedPolicy) -> list[float | None]:
     ]
 
 
-def table() -> str:
-    """All figures as Markdown."""
-    lines = ["| policy | " + " | ".join(COLUMNS) + " |", "|" + " --- |" * (len(COLUMNS) + 1)]
-    for file in sorted(FOLDER.glob("*.json")):
+def table(folder: Path, columns: Sequence[str]) -> str:
+    """All figures of a folder as Markdown, two decimals each."""
+    lines = ["| policy | " + " | ".join(columns) + " |", "|" + " --- |" * (len(columns) + 1)]
+    for file in sorted(folder.glob("*.json")):
         held = json.loads(file.read_text())
         lines.append(f"| {held['name']} | {' | '.join('' if x is None else f'{x:.2f}' for x in held['shares'])} |")
     return "\n".join(lines)
@@ -81,29 +82,37 @@ def table() -> str:
 
 def page(text: str) -> str:
     """``docs/results.md`` with the table made anew."""
-    return refilled(PAGE, text, {"sides": table()})
+    return refilled(PAGE, text, {"sides": table(FOLDER, COLUMNS)})
 
 
-def main(arguments: list[str]) -> None:
-    """Play what is missing, and rewrite the table."""
+def fill(folder: Path, policies: Mapping[str, Path], played: Callable[[TrainedPolicy], list[float | None]]) -> None:
+    """Have those policies play of whom the folder has no figures."""
     set_threads(1, None)
-    FOLDER.mkdir(exist_ok=True)
-    unread = next((argument for argument in arguments if "=" not in argument), None)
-    if unread is not None:
-        raise UserError(f"{unread}: policies are given as NAME=POLICY.pt")
-    given = {name: Path(path) for name, _, path in (argument.partition("=") for argument in arguments)}
-    for name, path in (POLICIES | given).items():
-        file = FOLDER / f"{name.replace(', ', '_').replace(' ', '-')}.json"
+    folder.mkdir(exist_ok=True)
+    for name, path in policies.items():
+        file = folder / f"{name.replace(', ', '_').replace(' ', '-')}.json"
         if not file.exists():
             trained = load(path)
             told = {"name": name, "parameters": fingerprint(trained), "seed": SEED, "episodes": EPISODES}
-            file.write_text(json.dumps(told | {"shares": play(trained)}, indent=1) + "\n")
+            file.write_text(json.dumps(told | {"shares": played(trained)}, indent=1) + "\n")
             print(f"written: {file.relative_to(ROOT)}", flush=True)
-    PAGE.write_text(page(PAGE.read_text()))
+
+
+def named(arguments: Sequence[str]) -> dict[str, Path]:
+    """The policies that a command line names.
+
+    Raises:
+        UserError: an argument is no name and path.
+    """
+    unread = next((argument for argument in arguments if "=" not in argument), None)
+    if unread is not None:
+        raise UserError(f"{unread}: policies are given as NAME=POLICY.pt")
+    return {name: Path(path) for name, _, path in (argument.partition("=") for argument in arguments)}
 
 
 if __name__ == "__main__":
     try:
-        main(sys.argv[1:])
+        fill(FOLDER, POLICIES | named(sys.argv[1:]), play)
     except UserError as error:
         raise SystemExit(str(error)) from error
+    PAGE.write_text(page(PAGE.read_text()))

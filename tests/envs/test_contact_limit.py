@@ -17,10 +17,12 @@ ROD = RodParameters(substeps=50)
 PRESS = torch.tensor([1.0, 0.4])  # to the wall and along it, so that the tip does not rest between two columns
 
 
-def pressing(env, steps):
+def pressing(env, steps, without_obstacles=False):
     """Frames of arms that bend towards the wall and lean on it."""
     action = PRESS.expand(env.batch_size[0], 6, 2)
     td, frames = env.reset(), []
+    if without_obstacles:
+        env.scene.cylinders.mask.zero_()
     for _ in range(steps):
         td = env.step(td.set(entries.ACTION, action))["next"]
         frames.append(td.clone())
@@ -117,6 +119,43 @@ def test_contact_that_ends_an_episode_is_no_success_even_at_the_target(settings)
         assert verdict.success.item() is success
         assert verdict.terminated.item()
         assert verdict.contact_failure.item() is not success
+
+
+def test_a_push_within_a_step_counts_where_the_task_says_so(settings):
+    from envs_steps import one_step
+
+    config = dataclasses.replace(settings("task=wall_touch").task, max_contact_steps=2)
+    verdict = judge_dense(one_step(contact_steps=2, touching=False, pushed=True), config, 100)
+    assert verdict.contact_failure.item()
+    assert verdict.contact_steps.item() == 3
+
+
+@pytest.mark.parametrize("dense", [False, True], ids=["rows", "all rows"])
+def test_an_arm_that_leans_by_its_last_half_element_is_in_contact_within_steps_and_not_at_their_ends(limited, dense):
+    """PyElastica's last element reaches half its length beyond the tip, and touches there before any node does."""
+    steps = 36
+    with force_dense() if dense else nullcontext():
+        ends, within = (limited(1000, task={"contact_counts": counts}) for counts in ("at_end", "within"))
+        frames = [pressing(env, steps)[-1] for env in (ends, within)]
+    at_ends, pushes = (env.simulator.state.episodes.contact_steps for env in (ends, within))
+    assert torch.equal(frames[0][entries.TIP], frames[1][entries.TIP])  # to count is all that it does
+    assert (pushes > at_ends).all()
+
+
+def test_until_a_step_counts_as_contact_the_arm_moves_as_if_there_was_no_wall(limited):
+    walled, bare = limited(0, task={"contact_counts": "within"}), limited(0)
+    frames, free = pressing(walled, 60), pressing(bare, 60, without_obstacles=True)
+    failed = torch.stack([frame[entries.CONTACT_FAILURE].squeeze(-1) for frame in frames])
+    tips, free_tips = (torch.stack([frame[entries.TIP] for frame in played]) for played in (frames, free))
+    for row in range(3):
+        first = int(failed[:, row].nonzero()[0])
+        assert torch.equal(tips[:first, row], free_tips[:first, row])
+        assert not torch.equal(tips[first, row], free_tips[first, row])
+
+
+def test_an_unknown_way_to_count_is_refused(settings):
+    with pytest.raises(ValueError, match=r"task.contact_counts is 'nodes': it must be at_end or within"):
+        dataclasses.replace(settings("task=wall_touch").task, contact_counts="nodes")
 
 
 def test_an_evaluation_tells_where_failures_end(limited):

@@ -152,6 +152,24 @@ def test_cylinders_that_move_act_as_in_the_torch_backend(scene, friction, model)
     assert_close(CudaBackend(parameters).control_step(state, couple, **given), expected)
 
 
+@pytest.mark.parametrize("model", ["pyelastica", "exact"])
+def test_rods_that_are_pushed_are_marked(model):
+    parameters = arm(contact_model=model, substeps=5)
+    couple = couple_like(parameters, 3)
+    state = straight_rods(parameters, 3)
+    # within reach, out of it, within it of a rod that does not move
+    where = beside(state[:1], [4], 0.017)
+    apart = torch.tensor([[[0.0, 0.0, 0.0]], [[5.0, 0.0, 0.0]], [[0.0, 0.0, 0.0]]], dtype=torch.float64)
+    cylinders = where.expand(3).contiguous()
+    cylinders.start = cylinders.start + apart
+    given = {"cylinders": cylinders, "active": torch.tensor([True, True, False])}
+    for before in ([False, False, False], [False, True, True]):
+        found, expected = torch.tensor(before), torch.tensor(before)
+        CudaBackend(parameters).control_step(state, couple, **given, touched=found)
+        TorchBackend(parameters).control_step(state, couple, **given, touched=expected)
+        assert found.tolist() == expected.tolist() == [True, *before[1:]]
+
+
 def test_a_post_that_comes_from_afar_is_not_missed():
     """It comes over twice its reach within the step; the rod is at rest until then."""
     parameters = arm(n_elements=3, base_length=0.05, substeps=60)
