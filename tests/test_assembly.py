@@ -75,6 +75,12 @@ def test_an_oracle_is_mirrored_only_where_its_task_says_what_mirrors_what_it_is_
         configure(mirrored)
 
 
+@pytest.mark.parametrize("hidden", [40_000, 4 * 10**9, 4 * 10**18])  # 4e18 squared is no number of torch's
+def test_a_network_that_nobody_could_mean_is_refused_before_it_takes_memory(hidden):
+    with pytest.raises(UserError, match=r"^model=softgm of these sizes has more than 1,000,000,000 [^\n]*$"):
+        configure(["task=wall", "algo=softgm", f"model.hidden={hidden}"])
+
+
 def test_a_plain_vector_has_no_mirror_image():
     pytest.importorskip("vmas", reason="VMAS is an optional extra: pip install 'softgm-bench[vmas]'")
     vector = ["task=vmas_balance", "algo=ippo", "model=vector_mlp", "algo.actor.persistence=0"]

@@ -11,15 +11,17 @@ from torchrl.envs import EnvBase
 from softgm_bench import algorithms
 from softgm_bench.algorithms import Algorithm
 from softgm_bench.config import Config, compose, validate
-from softgm_bench.config.schema import GRAPHS
+from softgm_bench.config.schema import GRAPHS, model_name
 from softgm_bench.envs import SectionMixture, Sizes, entries, kind_of
 from softgm_bench.envs.interface import VECTOR
 from softgm_bench.envs.remembering import RememberingEnv
 from softgm_bench.envs.section_mixture import members, refuse_mixture, shares
 from softgm_bench.errors import UserError
 from softgm_bench.models import build_encoder
+from softgm_bench.models.registry import Encoder
 
 FITTING = {VECTOR: "vector_mlp"}  # models by layout; the others observe graphs
+MOST_PARAMETERS = 10**9  # of a network that acts for one section
 
 
 def configure(overrides: Sequence[str]) -> Config:
@@ -155,12 +157,29 @@ def _check_one(config: Config) -> None:
             )
         if getattr(getattr(config.algo, "actor", None), "mirror", None):
             _refuse_mirror(config, env.sizes)
-        encoder = build_encoder(config.model, env.sizes)
+        encoder = _outlined(config.model, env.sizes)
     except ValueError as error:
         raise UserError(str(error)) from error
     if not observed.issuperset(encoder.in_keys):
         fitting = FITTING.get(env.sizes.layout, "mlp or softgm")
         raise UserError(f"task={config.task.name} cannot be observed by this model: add model={fitting}")
+
+
+def _outlined(model: Any, sizes: Sizes) -> Encoder:
+    """Build a network without memory for its parameters.
+
+    Raises:
+        ValueError: it has more parameters than anything that could be meant, with one line naming the model.
+    """
+    advice = f"model={model_name(model)} of these sizes has more than {MOST_PARAMETERS:,} parameters; give smaller ones"
+    try:
+        with torch.device("meta"):
+            encoder = build_encoder(model, sizes)
+    except (RuntimeError, OverflowError) as error:  # more than a tensor can have
+        raise ValueError(advice) from error
+    if sum(parameter.numel() for parameter in encoder.parameters()) > MOST_PARAMETERS:
+        raise ValueError(advice)
+    return encoder
 
 
 def _refuse_mirror(config: Config, sizes: Sizes) -> None:

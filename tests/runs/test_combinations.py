@@ -84,7 +84,7 @@ def test_every_algorithm_trains_with_every_model_on_every_task(tmp_path, algo, m
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("algo", "task"), product(("softgm", "ippo", "masac", "iddpg"), every_task.FELT))
+@pytest.mark.parametrize(("algo", "task"), list(product(("softgm", "ippo", "masac", "iddpg"), every_task.FELT)))
 def test_algorithms_of_every_kind_train_on_walls_that_have_to_be_felt(tmp_path, algo, task):
     assert check_run(tmp_path, algo, f"task={task}", f"model={OWN[algo]}")["task"] == task
 
