@@ -90,7 +90,7 @@ def fill(folder: Path, policies: Mapping[str, Path], played: Callable[[TrainedPo
     set_threads(1, None)
     folder.mkdir(exist_ok=True)
     for name, path in policies.items():
-        file = folder / f"{name.replace(', ', '_').replace(' ', '-')}.json"
+        file = folder / f"{name.replace('`', '').replace(', ', '_').replace(' ', '-')}.json"
         if not file.exists():
             trained = load(path)
             told = {"name": name, "parameters": fingerprint(trained), "seed": SEED, "episodes": EPISODES}

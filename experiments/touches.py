@@ -20,10 +20,14 @@ from softgm_bench.episodes.policy import TrainedPolicy
 from softgm_bench.errors import UserError
 
 FOLDER = ROOT / "experiments" / "touches"
-TRIALS = ROOT / "experiments" / "trials" / "wall_sense"
+CAMPAIGN, TRIALS = ROOT / "experiments" / "campaign", ROOT / "experiments" / "trials" / "wall_sense"
 POLICIES = {
-    "SoftGM, seed 0, no contact at ends": TRIALS / "eased0_seed0_average" / "policy.pt",
-    "SoftGM without stage 1, seed 0, no contact at ends": TRIALS / "eased0_blind0_average" / "policy.pt",
+    "`wall_touch`, SoftGM, seed 0, at most 10 steps": CAMPAIGN / "wall_touch" / "softgm" / "seed0" / "policy.pt",
+    "`wall_touch`, SoftGM without stage 1, seed 0, at most 10 steps": (
+        CAMPAIGN / "wall_touch" / "softgm_no_stage1" / "seed0" / "policy.pt"
+    ),
+    "`wall_sense`, SoftGM, seed 0, none at ends": TRIALS / "eased0_seed0_average" / "policy.pt",
+    "`wall_sense`, SoftGM without stage 1, seed 0, none at ends": TRIALS / "eased0_blind0_average" / "policy.pt",
 }
 COLUMNS = (
     "success",

@@ -246,6 +246,23 @@ def test_the_table_of_sides_is_that_of_the_committed_figures_of_the_kept_policie
         assert len(figures["shares"]) == len(sides.COLUMNS)
 
 
+def test_the_table_of_touches_is_that_of_the_committed_figures_of_the_kept_policies(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "experiments")
+    touches = script(ROOT / "experiments" / "touches.py")
+    text = touches.PAGE.read_text()
+    assert touches.page(text) == text
+    held = {figures["name"]: figures for figures in map(json.loads, map(Path.read_text, touches.FOLDER.glob("*.json")))}
+    assert held.keys() == touches.POLICIES.keys()
+    for name, path in touches.POLICIES.items():
+        assert held[name]["parameters"] == policy.fingerprint(policy.load(path))
+        assert len(held[name]["shares"]) == len(touches.COLUMNS)
+    touch, blind_touch, eased, blind = (held[name]["shares"] for name in touches.POLICIES)
+    page = " ".join(text.split())
+    assert f"lean on the wall for {eased[2]:.0f} steps of an episode, the blind one for {blind[2]:.0f}.**" in page
+    missed = (f"{shares[2] / shares[1]:.1f}" for shares in (touch, blind_touch))
+    assert "arms are pushed in {} and {} times as many steps as are counted.".format(*missed) in page
+
+
 def test_what_is_said_of_the_curriculum_is_what_the_committed_trainings_hold(results):
     page = " ".join(results.PAGE.read_text().split())
     told = []

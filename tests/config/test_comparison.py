@@ -50,7 +50,7 @@ def test_what_came_later_is_free_unless_it_changes_numbers():
     networks = {f"algo.{part}.{norm}_norm" for part in ("actor", "critic") for norm in ("embedding", "hidden")}
     networks |= {"algo.actor.relative_points", "algo.actor.memory", "algo.actor.mirror", "model.remember", "matmul"}
     surfaces = {f"task.{name}_coefficient" for name in ("friction", "velocity_damping")}
-    tasks = surfaces | {"task.max_contact_steps", "task.reward.lambda_fail"}
+    tasks = surfaces | {"task.max_contact_steps", "task.contact_counts", "task.reward.lambda_fail"}
     eased = ("easier_share", "easy_contact_steps", "easy_target_offset", "target_power")
     tasks |= {f"task.curriculum.{name}" for name in eased}
     assert set(NEUTRAL) - set(FREE) == networks | tasks
