@@ -89,6 +89,8 @@ SENSING = {  # rows of the page: folders
     "SoftGM without stage 1, seed 0, no contact, `easy_contact_steps=5`, `mirror=average`": (
         "trials/wall_sense/eased0_blind0_average"
     ),
+    "SoftGM, seed 0, no push, `easy_contact_steps=10`, `mirror=average`": "trials/wall_sense/within0_seed0_average",
+    "SoftGM, seed 1, no push, `easy_contact_steps=10`, `mirror=average`": "trials/wall_sense/within0_seed1_average",
 }
 
 
@@ -207,7 +209,10 @@ def test_what_is_said_of_a_wall_that_may_not_be_touched_is_what_its_trials_hold(
     eased = ROOT / "experiments" / SENSING["SoftGM, seed 0, no contact, `easy_contact_steps=5`, `mirror=average`"]
     blind = eased.with_name("eased0_blind0_average")
     final = json.loads((eased / "summary.json").read_text())["final_evaluation"]["success_rate"]
-    assert "not to touch: {mean:.3f} [{low:.3f}, {high:.3f}] of 1000 scenes after three".format(**final) in page
+    assert (
+        "not to touch by this count: {mean:.3f} [{low:.3f}, {high:.3f}] of 1000 scenes after three".format(**final)
+        in page
+    )
     curve = script(ROOT / "experiments" / "trials.py").curve(eased)
     assert (
         f"({curve[6]:.2f} of 256 scenes), and from there on it learnt to go back and round ({curve[7]:.2f} after"
@@ -225,6 +230,19 @@ def test_what_is_said_of_a_wall_that_may_not_be_touched_is_what_its_trials_hold(
     failures = json.loads((blind / "evaluations" / "none" / "summary.json").read_text())["metrics"]
     crashed = failures["contact_failure"] / (1.0 - alone.mean()) / len(alone)
     assert 0.3 < crashed < 0.35  # two of three are of something else
+
+
+def test_what_is_said_of_a_wall_that_may_not_push_is_what_its_trials_hold(results):
+    names = (f"SoftGM, seed {seed}, no push, `easy_contact_steps=10`, `mirror=average`" for seed in (0, 1))
+    folders = [ROOT / "experiments" / SENSING[name] for name in names]
+    page = " ".join(results.PAGE.read_text().split())
+    assert "stopped after {} and {} million frames: both".format(*map(millions, folders)) in page
+    played = results.episodes_in(folders[0] / "evaluations")
+    success, hidden = (played[shown]["success"] for shown in ("none", "blind"))
+    metrics = json.loads((folders[0] / "evaluations" / "none" / "summary.json").read_text())["metrics"]
+    assert metrics["contact_failure"] == (success == 0.0).sum()
+    told = "seed 0 has {:.3f}, all of its {} failures are of contact, and shown no obstacle it has {:.3f}:"
+    assert told.format(success.mean(), metrics["contact_failure"], hidden.mean()) in page
 
 
 @pytest.mark.parametrize("name", FELT)
