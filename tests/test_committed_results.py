@@ -120,6 +120,10 @@ def test_what_is_said_of_a_million_frames_of_basic_is_what_its_cells_hold(campai
     assert f"MADDPG's one seed is above them all, {maddpg:.3f}" in page
     told = f"{whole:.3f} whole, at {without2:.3f} without stage 2, where nobody hears anybody, and at **{without1:.3f}"
     assert f"Seed 0 ends at {told} without stage 1" in page
+    deep = json.loads((ROOT / "experiments/trials/basic/softgm_no_stage1_layers-4/summary.json").read_text())
+    deep = deep["final_evaluation"]["success_rate"]
+    assert "seed 0 ends at {mean:.3f} [{low:.3f}, {high:.3f}]**".format(**deep) in page
+    assert deep["mean"] - without1 > 0.5 * (whole - without1)
 
 
 def test_a_run_that_is_shorter_than_its_cell_is_no_part_of_the_campaign(campaign, monkeypatch, tmp_path):
