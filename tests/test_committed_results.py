@@ -120,6 +120,11 @@ def test_what_is_said_of_a_million_frames_of_basic_is_what_its_cells_hold(campai
     assert f"MADDPG's one seed is above them all, {maddpg:.3f}" in page
     told = f"{whole:.3f} whole, at {without2:.3f} without stage 2, where nobody hears anybody, and at **{without1:.3f}"
     assert f"Seed 0 ends at {told} without stage 1" in page
+    seeds = (
+        campaign.runs()[f"basic/softgm_no_stage1/seed{seed}"].summary["final_evaluation"]["success_rate"]["mean"]
+        for seed in (1, 2)
+    )
+    assert "told of** ({:.3f} and {:.3f} with seeds 1 and 2)".format(*seeds) in page
     deep = json.loads((ROOT / "experiments/trials/basic/softgm_no_stage1_layers-4/summary.json").read_text())
     deep = deep["final_evaluation"]["success_rate"]
     assert "seed 0 ends at {mean:.3f} [{low:.3f}, {high:.3f}]**".format(**deep) in page

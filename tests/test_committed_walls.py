@@ -91,6 +91,9 @@ SENSING = {  # rows of the page: folders
     ),
     "SoftGM, seed 0, no push, `easy_contact_steps=10`, `mirror=average`": "trials/wall_sense/within0_seed0_average",
     "SoftGM, seed 1, no push, `easy_contact_steps=10`, `mirror=average`": "trials/wall_sense/within0_seed1_average",
+    "SoftGM, seed 0, no push, `easy_contact_steps=20`, `easy_target_offset=1`, `promote=0.75`, `mirror=average`": (
+        "trials/wall_sense/within0_offset_seed0_average"
+    ),
 }
 
 
@@ -237,6 +240,11 @@ def test_what_is_said_of_a_wall_that_may_not_push_is_what_its_trials_hold(result
     folders = [ROOT / "experiments" / SENSING[name] for name in names]
     page = " ".join(results.PAGE.read_text().split())
     assert "stopped after {} and {} million frames: both".format(*map(millions, folders)) in page
+    other = ROOT / "experiments/trials/wall_sense/within0_offset_seed0_average"
+    last = [float(row["success_rate"]) for row in rows(other / "metrics.csv")[-50:] if int(row["episodes"])]
+    assert f"After {millions(other)} million frames it succeeds in half of the easiest scenes" in page
+    assert 0.45 < np.mean(last) < 0.55
+    assert {float(row["difficulty"]) for row in rows(other / "metrics.csv")} == {0.0}
     played = results.episodes_in(folders[0] / "evaluations")
     success, hidden = (played[shown]["success"] for shown in ("none", "blind"))
     metrics = json.loads((folders[0] / "evaluations" / "none" / "summary.json").read_text())["metrics"]
