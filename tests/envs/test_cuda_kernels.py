@@ -60,7 +60,7 @@ def test_sensing_rounds_every_product_and_stays_in_its_precision(dtype: torch.dt
 def test_the_verdict_stays_in_its_precision(settings, dtype: torch.dtype, tmp_path: Path):
     nodes, truths, whole = torch.zeros(2, 3, 61, dtype=dtype), torch.zeros(2, 61, dtype=torch.bool), torch.zeros(2)
     action, flag, count = torch.zeros(2, 6, 2), truths[:, 0].clone(), whole.long()
-    step = (nodes, nodes, nodes[..., 0].clone(), action, action, truths, count, flag, flag, flag, count, count)
+    step = (nodes, nodes, nodes[..., 0].clone(), action, action, truths, flag, count, flag, flag, flag, count, count)
     config = settings("task=wall").task
     code = cuda_code.ptx(*cuda_code.launched(cuda_verdict, lambda: cuda_verdict.judge(step, config, 200)))
     assert (".f64" in code) == (dtype == torch.float64)
