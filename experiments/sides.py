@@ -9,9 +9,10 @@ target, which tells nothing on this task, but told all of it in the first stages
 
 import json
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from softgm_bench import api
@@ -47,12 +48,17 @@ def share(of: Tensor) -> float | None:
     return float(of.double().mean()) if len(of) else None
 
 
+def first_episodes(after: TensorDictBase) -> Tensor:
+    """Of each environment's steps those of its first episode, ``(num_envs, steps)`` bool."""
+    ends = after[entries.DONE].squeeze(-1)
+    return (ends.cumsum(1) - ends.long()) == 0
+
+
 def play(trained: TrainedPolicy) -> list[float | None]:
     """One number for each of ``COLUMNS``; sides are those of episodes that are under way."""
     frames = api.rollout(build_env(trained.config, EPISODES, SEED), trained, LENGTH)
     after = frames["next"]
-    ends = after[entries.DONE].squeeze(-1)
-    first = (ends.cumsum(1) - ends.long()) == 0  # of each environment's steps those of its first episode
+    first = first_episodes(after)
     ever = {key: (after[key].squeeze(-1) & first).any(1) for key in (entries.SUCCESS, entries.CONTACT_FAILURE)}
     tip, told, target = (
         values[..., 1] > 0.0 for values in (after[entries.TIP], frames[entries.PRIVILEGED], frames[entries.TARGET])
@@ -85,7 +91,7 @@ def page(text: str) -> str:
     return refilled(PAGE, text, {"sides": table(FOLDER, COLUMNS)})
 
 
-def fill(folder: Path, policies: Mapping[str, Path], played: Callable[[TrainedPolicy], list[float | None]]) -> None:
+def fill(folder: Path, policies: dict[str, Path], played: Callable[[TrainedPolicy], list[float | None]]) -> None:
     """Have those policies play of whom the folder has no figures."""
     set_threads(1, None)
     folder.mkdir(exist_ok=True)
@@ -110,9 +116,23 @@ def named(arguments: Sequence[str]) -> dict[str, Path]:
     return {name: Path(path) for name, _, path in (argument.partition("=") for argument in arguments)}
 
 
-if __name__ == "__main__":
+def main(
+    folder: Path,
+    policies: dict[str, Path],
+    played: Callable[[TrainedPolicy], list[float | None]],
+    page: Callable[[str], str],
+) -> None:
+    """Play what is missing, of these policies and of those that the command line names, and rewrite the page.
+
+    Raises:
+        SystemExit: a policy is not there, or an argument cannot be read.
+    """
     try:
-        fill(FOLDER, POLICIES | named(sys.argv[1:]), play)
+        fill(folder, policies | named(sys.argv[1:]), played)
     except UserError as error:
         raise SystemExit(str(error)) from error
     PAGE.write_text(page(PAGE.read_text()))
+
+
+if __name__ == "__main__":
+    main(FOLDER, POLICIES, play, page)

@@ -6,10 +6,8 @@ counts. Figures go to ``experiments/touches/<name>.json``; what lies there is no
 ``docs/results.md`` between ``<!-- touches -->`` and ``<!-- end -->`` is made of all of them.
 """
 
-import sys
-
 import torch
-from sides import EPISODES, LENGTH, PAGE, ROOT, SEED, fill, named, share, table
+from sides import EPISODES, LENGTH, PAGE, ROOT, SEED, first_episodes, main, share, table
 from torch import Tensor
 
 from softgm_bench import api
@@ -17,7 +15,6 @@ from softgm_bench.analysis.markdown import refilled
 from softgm_bench.assembly import build_env
 from softgm_bench.envs import SoftArmEnv, entries
 from softgm_bench.episodes.policy import TrainedPolicy
-from softgm_bench.errors import UserError
 
 FOLDER = ROOT / "experiments" / "touches"
 CAMPAIGN, TRIALS = ROOT / "experiments" / "campaign", ROOT / "experiments" / "trials" / "wall_sense"
@@ -54,9 +51,8 @@ def play(trained: TrainedPolicy) -> list[float | None]:
     env = build_env(trained.config, EPISODES, SEED)
     seen = watch(env)
     after = api.rollout(env, trained, LENGTH)["next"]
-    ends = after[entries.DONE].squeeze(-1)
-    first = (ends.cumsum(1) - ends.long()) == 0
-    pushed = torch.stack(seen[-ends.shape[1] :], dim=1) & first
+    first = first_episodes(after)
+    pushed = torch.stack(seen[-first.shape[1] :], dim=1) & first
     touching = (after[entries.CONTACT_NODES].squeeze(-1) > 0.0) & first
     success = (after[entries.SUCCESS].squeeze(-1) & first).any(1)
     return [
@@ -73,8 +69,4 @@ def page(text: str) -> str:
 
 
 if __name__ == "__main__":
-    try:
-        fill(FOLDER, POLICIES | named(sys.argv[1:]), play)
-    except UserError as error:
-        raise SystemExit(str(error)) from error
-    PAGE.write_text(page(PAGE.read_text()))
+    main(FOLDER, POLICIES, play, page)

@@ -69,13 +69,13 @@ class Obstacles(NamedTuple):
         velocity, touched = (None if value is None else value[rows] for value in (self.velocity, self.touched))
         return Obstacles(self.cylinders[rows], velocity, touched)
 
-    def at(self, time: float) -> Cylinders:
-        """Give the cylinders ``time`` s into the step."""
+    def at(self, time: float) -> "Obstacles":
+        """Give them ``time`` s into the step."""
         if self.velocity is None:
-            return self.cylinders
+            return self
         moved = self.cylinders.copy()
         moved.start = self.cylinders.start + time * self.velocity
-        return moved
+        return self._replace(cylinders=moved)
 
 
 class TorchBackend:
@@ -184,9 +184,7 @@ class TorchBackend:
             constants = self._constants_of(bodies, motion.position)
             for substep in range(begun, end):
                 # contact acts in the middle of a substep
-                now = None
-                if obstacles is not None:
-                    now = obstacles._replace(cylinders=obstacles.at((substep + 0.5) * self.parameters.dt))
+                now = None if obstacles is None else obstacles.at((substep + 0.5) * self.parameters.dt)
                 motion = self._substep(motion, constants, couple, force, now)
             return motion
 
