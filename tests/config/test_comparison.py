@@ -51,6 +51,6 @@ def test_what_came_later_is_free_unless_it_changes_numbers():
     networks |= {"algo.actor.relative_points", "algo.actor.memory", "algo.actor.mirror", "model.remember", "matmul"}
     surfaces = {f"task.{name}_coefficient" for name in ("friction", "velocity_damping")}
     tasks = surfaces | {"task.max_contact_steps", "task.contact_counts", "task.reward.lambda_fail"}
-    eased = ("easier_share", "easy_contact_steps", "easy_target_offset", "target_power")
+    eased = ("easier_share", "easy_contact_steps", "contact_stages", "easy_target_offset", "target_power")
     tasks |= {f"task.curriculum.{name}" for name in eased}
     assert set(NEUTRAL) - set(FREE) == networks | tasks

@@ -110,6 +110,23 @@ def test_environments_behind_the_leading_ones_allow_what_their_own_difficulty_do
     assert torch.equal(-episodes.contact_steps, further.round().to(torch.int64))
 
 
+def test_scenes_may_become_the_tasks_own_before_the_limit_of_contact_does(settings):
+    words = ("enabled=true", "stages=4", "contact_stages=2", "easy_contact_steps=100")
+    task = settings("task=wall_touch", *(f"task.curriculum.{word}" for word in words)).task
+    env, plain = (make_env(task, ROD, 4, seed=0, curriculum=curriculum) for curriculum in (True, False))
+    state = env.simulation_state()
+    for stage, further in ((1, 90), (2, 90), (3, 45), (4, 0)):
+        state["progress", "stage"].fill_(stage)
+        env.load_simulation_state(state)
+        for each in (env, plain):
+            each.set_seed(7)
+            each.reset()
+        drawn, own = (each.simulator.state.episodes for each in (env, plain))
+        assert (drawn.contact_steps == -further).all()
+        assert (drawn.difficulty == stage / 4).all()
+        assert torch.equal(drawn.scene.target, own.scene.target) is (stage >= 2)
+
+
 def test_contact_that_ends_an_episode_is_no_success_even_at_the_target(settings):
     from envs_steps import one_step
 

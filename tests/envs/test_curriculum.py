@@ -12,14 +12,21 @@ from hypothesis import strategies as st
 from dense import force_dense
 from every_task import TASKS
 from softgm_bench.assembly import configure
-from softgm_bench.envs.curriculum import difficulty, first_progress, note_ends
+from softgm_bench.envs.curriculum import difficulty, first_progress, further_contact, note_ends, scene_difficulty
 from softgm_bench.envs.tasks import make_task
 from softgm_bench.envs.tasks.base import CurriculumConfig, eased
 from softgm_bench.errors import UserError
 
 ENABLED = "task.curriculum.enabled=true"
 FOUR = CurriculumConfig(
-    enabled=True, stages=2, episodes=4, promote=0.6, demote=0.2, easier_share=0.0, easy_contact_steps=None
+    enabled=True,
+    stages=2,
+    episodes=4,
+    promote=0.6,
+    demote=0.2,
+    easier_share=0.0,
+    easy_contact_steps=None,
+    contact_stages=0,
 )
 
 
@@ -316,6 +323,25 @@ def test_targets_of_the_other_tasks_fill_ranges_between_the_easiest_and_their_ow
         assert found.max() - found.min() > 0.5 * (high - low)
 
 
+@hypothesis_settings(max_examples=100, deadline=None)
+@given(st.integers(1, 60), st.data())
+def test_the_last_stages_lower_the_limit_of_contact_alone_where_the_settings_say_so(stages, data):
+    last = data.draw(st.integers(0, stages - 1))
+    task = configure(["task=wall_touch", ENABLED]).task  # 10 steps in contact
+    curriculum = dataclasses.replace(task.curriculum, stages=stages, contact_stages=last, easy_contact_steps=40)
+    task = dataclasses.replace(task, curriculum=curriculum)
+    for stage in range(stages + 1):
+        progress = first_progress(1, torch.device("cpu"))
+        progress.stage.fill_(stage)
+        now = difficulty(progress, curriculum)
+        scenes, left = scene_difficulty(now, curriculum).item(), further_contact(now, task).item()
+        assert scenes == pytest.approx(min(1.0, stage / (stages - last)), abs=1e-9)
+        assert (scenes == 1.0) is (stage >= stages - last)
+        assert left == pytest.approx(30 * min(1.0, (stages - stage) / (last or stages)), abs=0.5 + 1e-9)
+        assert last == 0 or stage >= stages - last or left == 30
+    assert left == 0
+
+
 @pytest.mark.parametrize(
     ("override", "message"),
     [
@@ -330,6 +356,12 @@ def test_targets_of_the_other_tasks_fill_ranges_between_the_easiest_and_their_ow
             "task.curriculum.easy_contact_steps=3",
             r"task.curriculum.easy_contact_steps is 3, task.max_contact_steps None",
         ),
+        (
+            "task.curriculum.contact_stages=10",
+            r"task.curriculum.contact_stages is 10: .* below task.curriculum.stages, 10",
+        ),
+        ("task.curriculum.contact_stages=-1", r"task.curriculum.contact_stages is -1"),
+        ("task.curriculum.contact_stages=4", r"contact_stages is 4: without task.curriculum.easy_contact_steps"),
         ("task.curriculum.easy_opening_side=0.2", r"task.curriculum.easy_opening_side is 0.2"),
         ("task.curriculum.easy_target_offset=1.5", r"task.curriculum.easy_target_offset is 1.5: it must lie between"),
         ("task.curriculum.target_power=0.0", r"task.curriculum.target_power is 0.0: it must be above 0"),

@@ -53,15 +53,25 @@ def difficulty(progress: Progress, config: CurriculumConfig) -> Tensor:
     return progress.stage[0].to(torch.float64) / config.stages
 
 
-def further_contact(level: Tensor, config: TaskConfig) -> Tensor | None:
-    """Give how many more steps in contact than the task scenes of a difficulty allow, int64; None where none ever does.
+def scene_difficulty(level: Tensor, config: CurriculumConfig) -> Tensor:
+    """Give the difficulty by which scenes are drawn: ``level``, or ahead of it where the last stages change none."""
+    if not config.contact_stages:
+        return level
+    ahead = level * (config.stages / (config.stages - config.contact_stages))
+    return ahead.round(decimals=12).clamp(max=1.0)  # exactly 1 where only the limit of contact is left to change
 
-    They fall on a straight line to 0 at the task's own scenes, each rounded to a whole step.
+
+def further_contact(level: Tensor, config: TaskConfig) -> Tensor | None:
+    """Give how many more steps in contact than the task episodes of a difficulty allow, int64; None: never any more.
+
+    They fall on a straight line to 0 at the task's own, each rounded to a whole step: over all stages, or over the
+    last ``contact_stages``.
     """
-    easy, own = config.curriculum.easy_contact_steps, config.max_contact_steps
+    easy, own, settings = config.curriculum.easy_contact_steps, config.max_contact_steps, config.curriculum
     if easy is None or own is None:
         return None
-    return ((easy - own) * (1.0 - level)).round().to(torch.int64)
+    left = (1.0 - level) * (settings.stages / (settings.contact_stages or settings.stages))
+    return ((easy - own) * left.clamp(max=1.0)).round().to(torch.int64)
 
 
 def leading(num_envs: int, config: CurriculumConfig) -> int:

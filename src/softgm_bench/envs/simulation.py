@@ -16,7 +16,15 @@ from tensordict import TensorClass, TensorDictBase
 from torch import Tensor
 
 from softgm_bench.envs import entries
-from softgm_bench.envs.curriculum import Progress, difficulty, first_progress, further_contact, leading, note_ends
+from softgm_bench.envs.curriculum import (
+    Progress,
+    difficulty,
+    first_progress,
+    further_contact,
+    leading,
+    note_ends,
+    scene_difficulty,
+)
 from softgm_bench.envs.perturbation import Perturbation, PerturbationConfig
 from softgm_bench.envs.sensing import Bins, Sight, SlotTable, bins_per_cylinder, cut_into_bins, empty_table, look
 from softgm_bench.envs.tasks.base import Scene, Task
@@ -297,14 +305,14 @@ class Simulator:
             return self.task.sample(count, self._generator), None
         config, num_envs = self.task.config.curriculum, len(progress.stage)
         level = difficulty(progress, config)
-        scene = self.task.sample(count, self._generator, level)
+        scene = self.task.sample(count, self._generator, scene_difficulty(level, config))
         first = leading(num_envs, config)
         if first == num_envs:
             return scene, level.expand(count)
         below = level * torch.rand((), generator=self._generator, dtype=torch.float64, device=self.device)
         environment = torch.arange(num_envs, device=self.device) if rows is None else rows
         behind = environment >= first
-        easier = self.task.sample(count, self._generator, below)
+        easier = self.task.sample(count, self._generator, scene_difficulty(below, config))
         return easier.where(behind, scene), torch.where(behind, below, level)
 
     def _blank(self, count: int) -> Beginning:

@@ -63,6 +63,7 @@ class CurriculumConfig:
     demote: float
     easier_share: float
     easy_contact_steps: int | None
+    contact_stages: int
 
     def __post_init__(self) -> None:
         """Refuse values by which nothing could be decided.
@@ -80,6 +81,16 @@ class CurriculumConfig:
             )
         if not 0.0 <= self.easier_share < 1.0:
             raise ValueError(f"task.curriculum.easier_share is {self.easier_share}: it must be at least 0 and below 1")
+        if not 0 <= self.contact_stages < self.stages:
+            raise ValueError(
+                f"task.curriculum.contact_stages is {self.contact_stages}: "
+                f"it must be at least 0 and below task.curriculum.stages, {self.stages}"
+            )
+        if self.contact_stages and self.easy_contact_steps is None:
+            raise ValueError(
+                f"task.curriculum.contact_stages is {self.contact_stages}: without task.curriculum.easy_contact_steps "
+                "nothing would change in these stages; it must be 0"
+            )
 
 
 @dataclass
