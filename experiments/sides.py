@@ -3,7 +3,7 @@
 Kept policies, and those that are named, play the same episodes. Where the tip is after some control steps is held
 against the side of the opening that leads through, which nothing but senses can tell, and against the side of the
 target, which tells nothing on this task, but told all of it in the first stages of the curriculum. Figures go to
-``experiments/sides/<name>.json``; what lies there is not played again. Then the table in ``docs/results.md`` between
+``experiments/sides/<name>.json``; what lies there is not played again. Then the table in ``docs/choosing.md`` between
 ``<!-- sides -->`` and ``<!-- end -->`` is made of all of them.
 """
 
@@ -25,7 +25,7 @@ from softgm_bench.runs.machine import set_threads
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "experiments" / "sides"
-PAGE = ROOT / "docs" / "results.md"
+PAGE = ROOT / "docs" / "choosing.md"
 CAMPAIGN = ROOT / "experiments" / "campaign" / "wall_sense"
 POLICIES = {
     "SoftGM, seed 0": CAMPAIGN / "softgm" / "seed0" / "policy.pt",
@@ -87,7 +87,7 @@ def table(folder: Path, columns: Sequence[str]) -> str:
 
 
 def page(text: str) -> str:
-    """``docs/results.md`` with the table made anew."""
+    """``docs/choosing.md`` with the table made anew."""
     return refilled(PAGE, text, {"sides": table(FOLDER, COLUMNS)})
 
 

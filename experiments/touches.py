@@ -3,7 +3,7 @@
 Policies play the episodes of ``experiments/sides.py`` by their own rules. It is taken down in which control steps an
 obstacle pushes the arm, in any substep, and at whose end a node touches one, which is what ``contact_counts=at_end``
 counts. Figures go to ``experiments/touches/<name>.json``; what lies there is not played again. Then the table in
-``docs/results.md`` between ``<!-- touches -->`` and ``<!-- end -->`` is made of all of them.
+``docs/choosing.md`` between ``<!-- touches -->`` and ``<!-- end -->`` is made of all of them.
 """
 
 import torch
@@ -64,7 +64,7 @@ def play(trained: TrainedPolicy) -> list[float | None]:
 
 
 def page(text: str) -> str:
-    """``docs/results.md`` with the table made anew."""
+    """``docs/choosing.md`` with the table made anew."""
     return refilled(PAGE, text, {"touches": table(FOLDER, COLUMNS)})
 
 

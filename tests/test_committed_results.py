@@ -224,7 +224,7 @@ def test_no_kept_policy_names_a_folder_of_the_machine_that_trained_it():
     ],
 )
 def test_a_kept_policy_is_that_of_its_evaluations_and_the_page_says_what_they_hold(results, evaluations, frames, name):
-    page = results.PAGE.read_text()
+    page = results.PAGE.read_text() + (ROOT / "docs" / "choosing.md").read_text()
     folder = ROOT / "experiments" / evaluations
     kept = folder.with_name("policy.pt") if folder.name == "evaluations" else folder.with_suffix(".pt")
     assert policy.load(kept).frames == frames

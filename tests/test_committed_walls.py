@@ -12,6 +12,8 @@ from committed import ROOT, script
 from softgm_bench.analysis.statistics import mcnemar
 from softgm_bench.episodes import certified, policy
 
+CHOOSING = ROOT / "docs" / "choosing.md"
+
 
 @pytest.fixture(scope="module")
 def results():
@@ -99,12 +101,12 @@ SENSING = {  # rows of the page: folders
 
 @pytest.mark.parametrize("name", SENSING)
 def test_the_curves_of_the_choice_between_two_openings_are_those_of_the_committed_runs(name, results):
-    page = results.PAGE.read_text().partition("### A choice between two openings")[2].partition("\n### ")[0]
+    page = CHOOSING.read_text()
     assert row_of(page, name) == reached(ROOT / "experiments" / SENSING[name])
 
 
 def test_what_is_said_of_the_choice_between_two_openings_is_what_the_committed_runs_hold(results):
-    page = " ".join(results.PAGE.read_text().split())
+    page = " ".join(CHOOSING.read_text().split())
     folders = [ROOT / "experiments" / folder for folder in list(SENSING.values())[:3]]
     finals = [json.loads((folder / "summary.json").read_text())["final_evaluation"] for folder in folders]
     blind = finals[2]
@@ -127,7 +129,7 @@ def test_what_is_said_of_the_choice_between_two_openings_is_what_the_committed_r
 
 
 def test_what_is_said_of_the_trial_that_chooses_is_what_it_holds(results):
-    page = " ".join(results.PAGE.read_text().split())
+    page = " ".join(CHOOSING.read_text().split())
     folder = ROOT / "experiments" / SENSING["SoftGM, seed 1, `promote=0.75`"]
     final = json.loads((folder / "summary.json").read_text())["final_evaluation"]
     assert "{mean:.3f} [{low:.3f}, {high:.3f}] of 1000 scenes at the end".format(**final["success_rate"]) in page
@@ -143,7 +145,7 @@ def test_what_is_said_of_a_curriculum_that_goes_back_is_what_its_trial_holds(res
     folder = ROOT / "experiments" / SENSING["SoftGM, seed 0, `promote=0.75`, `demote=0.5`"]
     curve = script(ROOT / "experiments" / "trials.py").curve(folder)
     told = ", ".join(f"{curve[number]:.2f}" for number in (5, 6, 7))
-    page = " ".join(results.PAGE.read_text().split())
+    page = " ".join(CHOOSING.read_text().split())
     assert f"{told} of 256 scenes after 1.25, 1.5, 1.75 million frames" in page
 
 
@@ -151,7 +153,7 @@ def test_easier_scenes_were_stopped_when_the_page_says(results):
     names = (f"SoftGM, seed {seed}, `easier_share=0.5`" for seed in (0, 1))
     frames = [millions(ROOT / "experiments" / SENSING[name]) for name in names]
     told = "stopped after {} and {} million frames): a target".format(*frames)
-    assert told in " ".join(results.PAGE.read_text().split())
+    assert told in " ".join(CHOOSING.read_text().split())
 
 
 def test_what_is_said_of_the_mirror_is_what_its_trials_hold(results):
@@ -162,7 +164,7 @@ def test_what_is_said_of_the_mirror_is_what_its_trials_hold(results):
     canonical = trained["SoftGM, seed 0, `mirror=canonical`"]
     without = (trained["SoftGM, seed 0"], trained["SoftGM, seed 1"])
     half = [f"{curve(folder)[2]:.2f}" for folder in (seed0, seed1, *without)]
-    page = " ".join(results.PAGE.read_text().split())
+    page = " ".join(CHOOSING.read_text().split())
     assert "succeed in {} and {} of the scenes, without it in {} and {}.".format(*half) in page
     after = [f"{curve(folder)[number]:.2f}" for number in (6, 4) for folder in (seed0, seed1)]
     told = "seed 0 succeeds in {} of 256 scenes and seed 1, which never chooses without the mirror, in {} after 1.5 "
@@ -198,7 +200,7 @@ def test_what_is_said_of_a_wall_that_may_not_be_touched_is_what_its_trials_hold(
     hidden = results.episodes_in(folder / "evaluations")["blind"]["success"].mean()
     rates = f"{np.isfinite(touched).mean():.3f}", f"{(touched == 0).mean():.3f}"
     left, right = by_side(np.isfinite(touched))
-    page = " ".join(results.PAGE.read_text().split())
+    page = " ".join(CHOOSING.read_text().split())
     told = "after {} million frames, in {} of the 500 scenes, in {} without any contact;"
     assert told.format(millions(folder), *rates) in page
     assert f"on one side again, {left} with the open opening on the left and {right} with it on the right," in page
@@ -238,7 +240,7 @@ def test_what_is_said_of_a_wall_that_may_not_be_touched_is_what_its_trials_hold(
 def test_what_is_said_of_a_wall_that_may_not_push_is_what_its_trials_hold(results):
     names = (f"SoftGM, seed {seed}, no push, `easy_contact_steps=10`, `mirror=average`" for seed in (0, 1))
     folders = [ROOT / "experiments" / SENSING[name] for name in names]
-    page = " ".join(results.PAGE.read_text().split())
+    page = " ".join(CHOOSING.read_text().split())
     assert "stopped after {} and {} million frames: both".format(*map(millions, folders)) in page
     other = ROOT / "experiments/trials/wall_sense/within0_offset_seed0_average"
     last = [float(row["success_rate"]) for row in rows(other / "metrics.csv")[-50:] if int(row["episodes"])]
@@ -256,7 +258,7 @@ def test_what_is_said_of_a_wall_that_may_not_push_is_what_its_trials_hold(result
 @pytest.mark.parametrize("name", FELT)
 def test_how_often_a_wall_is_touched_on_the_way_is_what_the_committed_episodes_hold(name, results):
     touched = touching(ROOT / "experiments" / FELT[name] / "evaluations" / "none")
-    assert row_of(results.PAGE.read_text(), name) == [f"{(touched <= steps).mean():.2f}" for steps in range(6)]
+    assert row_of(CHOOSING.read_text(), name) == [f"{(touched <= steps).mean():.2f}" for steps in range(6)]
 
 
 def test_the_table_of_sides_is_that_of_the_committed_figures_of_the_kept_policies():
@@ -290,7 +292,7 @@ def test_the_table_of_touches_is_that_of_the_committed_figures_of_the_kept_polic
 
 
 def test_what_is_said_of_the_curriculum_is_what_the_committed_trainings_hold(results):
-    page = " ".join(results.PAGE.read_text().split())
+    page = " ".join(CHOOSING.read_text().split())
     told = []
     for name in ("SoftGM, seed 1", "SoftGM, seed 0", "SoftGM, seed 1, `promote=0.75`"):
         metrics = rows(ROOT / "experiments" / SENSING[name] / "metrics.csv")
