@@ -35,7 +35,7 @@ def mix(nodes, sources, targets, own, first, source, n_agents, slope, own_weight
         slope: of the leaky ReLU below zero.
         own_weights: of self-loops, ``(T, H)``.
         weights: of edges, ``(E, H)``.
-        mixed: weighted sums, without the self-loop, ``(T, H, F)``.
+        mixed: weighted sums, without the self-loop, ``(H, T, F)``: each head multiplies its own by a matrix of its own.
     """
     n_heads = own.shape[1]
     for graph in numba.prange(own.shape[0] // n_agents):
@@ -52,10 +52,10 @@ def mix(nodes, sources, targets, own, first, source, n_agents, slope, own_weight
                     weights[edge, head] = math.exp(weights[edge, head] - peak)
                     total += weights[edge, head]
                 own_weights[row, head] /= total
-                mixed[row, head, :] = 0.0
+                mixed[head, row, :] = 0.0
                 for edge in range(first[row], first[row + 1]):
                     weights[edge, head] /= total
-                    add_scaled(weights[edge, head], nodes[source[edge]], mixed[row, head])
+                    add_scaled(weights[edge, head], nodes[source[edge]], mixed[head, row])
 
 
 @njit(parallel=True, error_model="numpy", fastmath=FAST)
@@ -85,7 +85,7 @@ def differentiate(inputs, rows, first, source, n_agents, slope, own_weights, wei
             d_sources[source[edge]] = 0.0
         for row in agents:
             for head in range(n_heads):
-                new = of_mixed[row, head]
+                new = of_mixed[head, row]
                 mean = own_weights[row, head] * of_own_weights[row, head]  # of the weights' gradients
                 for edge in range(first[row], first[row + 1]):
                     mean += weights[edge, head] * dot(new, nodes[source[edge]])
@@ -127,7 +127,7 @@ class EdgeAttention(torch.autograd.Function):
         sources = functional.linear(nodes, rows, offset)
         slope = own.numpy().dtype.type(slope)
         own_weights, weights = torch.empty_like(own), own.new_empty(len(source), own.shape[1])
-        mixed = own.new_empty(*own.shape, nodes.shape[1])
+        mixed = own.new_empty(own.shape[1], own.shape[0], nodes.shape[1])
         inputs = arrays((nodes, sources, targets, own, first, source))
         mix(*inputs, n_agents, slope, *arrays((own_weights, weights, mixed)))
         ctx.save_for_backward(nodes, sources, targets, own, rows, first, source, own_weights, weights)

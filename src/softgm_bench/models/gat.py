@@ -186,7 +186,7 @@ class GraphAttention(nn.Module):
             source = functional.linear(slots, *self._source_rows(affine)).mT.unsqueeze(1) + absent
             scores = self._score(torch.cat([own.unsqueeze(-1), source], -1) + target.unsqueeze(-1))
         own_weight, weights = scores.softmax(-1).split([1, slots.shape[1]], -1)
-        mixed = torch.bmm(weights.flatten(1, 2), slots).view(-1, self.heads, slots.shape[-1])
+        mixed = torch.bmm(weights.flatten(1, 2), slots).view(-1, self.heads, slots.shape[-1]).transpose(0, 1)
         own_weight = own_weight.flatten(0, 1)
         return self._mixed_message(agents, mixed, own_weight, affine), own_weight.squeeze(-1), weights
 
@@ -197,10 +197,10 @@ class GraphAttention(nn.Module):
         return torch.bmm(self.source.unsqueeze(1), rows).squeeze(1), part
 
     def _mixed_message(self, agents: Projection, mixed: Tensor, own_weight: Tensor, affine: Affine) -> Tensor:
-        """New agents ``(T, out_features)`` from weighted sums of nodes ``(T, H, in)`` and own weights ``(T, H, 1)``."""
+        """New agents ``(T, out_features)`` from weighted sums of nodes ``(H, T, in)`` and own weights ``(T, H, 1)``."""
         weight, offset = affine
         heads = weight.unflatten(0, (self.heads, self.channels))
-        incoming = torch.bmm(mixed.transpose(0, 1), heads.mT).transpose(0, 1)  # (T, H, C)
+        incoming = torch.bmm(mixed, heads.mT).transpose(0, 1)  # (T, H, C)
         if offset is not None:  # as often as the weights say, which with the own one sum to 1
             incoming = torch.addcmul(incoming, 1.0 - own_weight, offset.unflatten(0, self.source.shape))
         return self.output(torch.addcmul(incoming, own_weight, agents.message))
