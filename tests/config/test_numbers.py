@@ -31,6 +31,19 @@ def test_numbers_are_finite_wherever_numbers_are(override, says):
     assert refusal(override) == f"{says}: it must be a finite number"
 
 
+@pytest.mark.parametrize(
+    ("overrides", "key"),
+    [
+        (("model.layers=5000",), "model.layers"),
+        (("algo=mappo", "model.layers=5000"), "model.layers"),
+        (("algo.critic.mlp={hidden:8,layers:5000,velocity_scale:1.0}",), "algo.critic.mlp.layers"),
+        (("model=informarl", "model.embedding_layers=5000"), "model.embedding_layers"),
+    ],
+)
+def test_networks_that_would_never_be_built_are_refused(overrides, key):
+    assert refusal(*overrides) == f"{key}=5000: it must be at most 1000"
+
+
 def test_what_has_no_limit_may_be_infinite_and_is_still_a_number():
     assert compose(["task=wall_fixed"]).task.max_path == float("inf")
     assert refusal("task=wall", "task.max_path=nan") == "task.max_path=nan: it must be a finite number"

@@ -114,6 +114,7 @@ def typed(composed: DictConfig) -> Config:
     assert isinstance(config, Config)
     _restore_tuples(config)
     numbers.check_ranges(config)
+    numbers.check_depths(plain(config))
     return config
 
 

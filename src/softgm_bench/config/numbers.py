@@ -9,6 +9,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from softgm_bench.errors import UserError
 
+MOST_LAYERS = 1000  # of a network; with many more, building one never ends
 INFINITE = "infinite"  # metadata of a field that may be an infinity: what has no limit
 
 
@@ -44,6 +45,19 @@ def check_ranges(instance: Any, prefix: str = "") -> None:
             if value[0] > value[1]:
                 right = [value[1], value[0]]
                 raise UserError(f"{key}={list(value)}: the lower end of a range comes first, as in {key}={right}")
+
+
+def check_depths(values: Any, prefix: str = "") -> None:
+    """Refuse networks of more than ``MOST_LAYERS`` layers, wherever settings count some (``layers``, ``..._layers``).
+
+    Raises:
+        UserError: naming the first such key, its value and what would be right.
+    """
+    for name, value in values.items() if isinstance(values, Mapping) else ():
+        key = f"{prefix}{name}"
+        if name.endswith("layers") and isinstance(value, int) and value > MOST_LAYERS:
+            raise UserError(f"{key}={value}: it must be at most {MOST_LAYERS}")
+        check_depths(value, f"{key}.")
 
 
 def _numbers(values: Any, key: str) -> Iterator[tuple[str, float]]:
