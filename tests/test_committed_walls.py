@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from omegaconf import OmegaConf
 
 from committed import ROOT, script
 from softgm_bench.analysis.statistics import mcnemar
@@ -253,6 +254,49 @@ def test_what_is_said_of_a_wall_that_may_not_push_is_what_its_trials_hold(result
     assert metrics["contact_failure"] == (success == 0.0).sum()
     told = "seed 0 has {:.3f}, all of its {} failures are of contact, and shown no obstacle it has {:.3f}:"
     assert told.format(success.mean(), metrics["contact_failure"], hidden.mean()) in page
+
+
+LATE = {  # rows of the page: trials in which contact becomes scarce after the scenes have become the task's own
+    "SoftGM, seed 0": "within0_last_seed0_average",
+    "SoftGM, seed 1": "within0_last_seed1_average",
+    "SoftGM, seed 0, gone on with": "within0_last_seed0_average_resumed",
+}
+
+
+@pytest.mark.parametrize("name", LATE)
+def test_how_far_contact_was_given_up_is_what_the_trials_hold(name):
+    folder = ROOT / "experiments/trials/wall_sense" / LATE[name]
+    metrics, config = rows(folder / "metrics.csv"), OmegaConf.load(folder / "config.yaml").task
+    curriculum = config.curriculum
+    assert (config.max_contact_steps, curriculum.easy_contact_steps) == (0, 50)
+    assert (curriculum.stages, curriculum.contact_stages) == (30, 20)
+    difficulty = np.array([float(row["difficulty"]) for row in metrics])
+    frames = np.array([int(row["frames"]) for row in metrics])
+    reached = [frames[difficulty > at - 1e-3] for at in (1 / 3, 2 / 3)]
+    told = [f"{found[0] / 1e6:.2f} M" if len(found) else "" for found in reached]
+    last = [(int(row["episodes"]), float(row["success_rate"])) for row in metrics[-50:] if int(row["episodes"])]
+    success = np.average([rate for _, rate in last], weights=[episodes for episodes, _ in last])
+    left = 50.0 * (1.0 - difficulty[-1]) * 1.5
+    told += [f"{millions(folder)} M", f"{left:.1f}", f"{success:.2f}"]
+    page = CHOOSING.read_text()
+    assert row_of(page.partition("## First to choose")[2], name) == told
+    passed = frames[difficulty > 1 / 3 + 1e-3][0] / 1e6
+    assert f"{passed:.2f} million" in page or f"after {passed:.2f}." in page
+
+
+def test_what_an_arm_does_that_is_let_push_is_what_its_episodes_hold():
+    scenes = certified.of_task("wall_sense")
+    closed = (scenes.privileged[:, 1] > 0.0) != (scenes.target[:, 1] > 0.0)  # on the side of the target
+    page = " ".join(CHOOSING.read_text().split())
+    shares = []
+    for trial in (LATE["SoftGM, seed 0"], LATE["SoftGM, seed 0, gone on with"]):
+        episodes = rows(ROOT / "experiments/trials/wall_sense" / trial / "evaluations/let_push/episodes.csv")
+        success = np.array([row["success"] == "True" for row in episodes])
+        length = np.array([int(row["length"]) for row in episodes])
+        shares.append((success.mean(), success[closed].mean(), np.median(length[closed & success])))
+    assert f"succeeds in {shares[0][0]:.3f} of the 500 scenes" in page
+    assert f"half of its successes take more than {shares[0][2]:.0f} steps" in page
+    assert f"Let push, it still succeeds in {shares[1][1]:.3f} of those scenes" in page
 
 
 @pytest.mark.parametrize("name", FELT)
