@@ -67,7 +67,8 @@ def further_contact(level: Tensor, config: TaskConfig) -> Tensor | None:
     They fall on a straight line to 0 at the task's own, each rounded to a whole step: over all stages, or over the
     last ``contact_stages``.
     """
-    easy, own, settings = config.curriculum.easy_contact_steps, config.max_contact_steps, config.curriculum
+    settings, own = config.curriculum, config.max_contact_steps
+    easy = settings.easy_contact_steps
     if easy is None or own is None:
         return None
     left = (1.0 - level) * (settings.stages / (settings.contact_stages or settings.stages))
