@@ -52,6 +52,7 @@ def write_run(
     curriculum: bool = False,
     perturbation: str = "none",
     recipe: str = "tuned",
+    start: str | None = None,
 ) -> Path:
     """A finished run; its evaluations during training rise to ``success``."""
     folder = root / task / label / f"seed{seed}"
@@ -70,6 +71,7 @@ def write_run(
         "recipe": recipe,
         "task": {"name": task, "horizon": 2000, "curriculum": {"enabled": curriculum}},
         "perturbation": {"name": perturbation},
+        "start": {"policy": start},
         "experiment": {"evaluation": {"horizon": 200, "final_horizon": None}},
     }
     (folder / "config.yaml").write_text(json.dumps(config))

@@ -74,6 +74,14 @@ def test_a_run_of_smoke_size_is_never_ranked(tmp_path):
     assert (pools["wall", "mappo"].marks, pools["wall", "mappo"].ranked) == ("", True)
 
 
+def test_a_run_that_began_with_a_trained_policy_is_marked_and_not_ranked(tmp_path):
+    write_run(tmp_path, "wall", "mappo", 0)
+    write_run(tmp_path, "wall", "softgm_started", 0, start="some.pt")
+    pools = pools_of(tmp_path)
+    assert (pools["wall", "softgm_started"].marks, pools["wall", "softgm_started"].ranked) == ("‖", False)
+    assert (pools["wall", "mappo"].marks, pools["wall", "mappo"].ranked) == ("", True)
+
+
 def test_a_curriculum_is_ranked_only_where_all_had_one(tmp_path):
     write_run(tmp_path, "wall", "softgm", 0, curriculum=True)
     write_run(tmp_path, "wall", "softgm_oracle", 0, observation="oracle")

@@ -50,6 +50,7 @@ def test_mistakes_in_bodies_are_one_line():
         "matmul=fp8",
         "matmul=tf32",
         "run_dir=''",
+        "start.critic_frames=-1",
         "experiment.total_frames=0",
         "experiment.num_envs=-2",
         "experiment.steps_per_batch=0",

@@ -49,6 +49,7 @@ def test_a_run_from_before_there_were_named_recipes_is_the_same_run():
 def test_what_came_later_is_free_unless_it_changes_numbers():
     networks = {f"algo.{part}.{norm}_norm" for part in ("actor", "critic") for norm in ("embedding", "hidden")}
     networks |= {"algo.actor.relative_points", "algo.actor.memory", "algo.actor.mirror", "model.remember", "matmul"}
+    networks |= {"start.policy", "start.critic_frames"}
     surfaces = {f"task.{name}_coefficient" for name in ("friction", "velocity_damping")}
     tasks = surfaces | {"task.max_contact_steps", "task.contact_counts", "task.reward.lambda_fail"}
     eased = ("easier_share", "easy_contact_steps", "contact_stages", "easy_target_offset", "target_power")

@@ -41,6 +41,11 @@ def test_a_value_depends_on_whether_the_task_hides_something():
     assert resolved("${if_hidden:1, 2}", task={"name": "mine"}) == 2
 
 
+def test_a_value_depends_on_whether_training_begins_with_a_policy():
+    assert resolved("${if_started:1, 2}", start={"policy": "some.pt"}) == 1
+    assert resolved("${if_started:1, 2}", start={"policy": None}) == 2
+
+
 @pytest.mark.parametrize(
     ("hidden", "model", "expected"), [(True, "softgm", 1), (True, "mlp", 2), (False, "softgm", 2), (False, "mlp", 2)]
 )

@@ -54,6 +54,17 @@ def test_what_was_trained_with_drawn_bodies_says_so_wherever_its_results_go():
     assert compose([]).randomise == RandomiseConfig()
 
 
+def test_what_began_with_a_trained_policy_says_so_and_lets_its_critic_learn_first():
+    config = compose(["start.policy=some.pt", "algo=masac", "perturbation=noise"])
+    assert config.label == "masac_noise_started"
+    assert config.run_dir == "outputs/basic/masac_noise_started/seed0"
+    assert config.start.critic_frames > 0
+    assert config.algo.random_frames == 0
+    fresh = compose(["algo=masac"])
+    assert (fresh.label, fresh.start.critic_frames) == ("masac", 0)
+    assert fresh.algo.random_frames > 0
+
+
 @pytest.mark.parametrize("algo", ["softgm", "iddpg", "isac"])
 def test_dataclasses_carry_no_values_of_their_own_but_the_arms(algo):
     config = compose([f"algo={algo}"])

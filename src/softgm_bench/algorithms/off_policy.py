@@ -1,5 +1,6 @@
 """Shared by DDPG and SAC: replay buffer, exploration, and how many gradient steps follow a batch of frames."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
@@ -166,12 +167,34 @@ class OffPolicy:
         self.replay = _make_replay(config.replay_capacity, env, n_privileged)
         self.frames = 0
         self._due = 0.0  # gradient steps, of which whole ones are taken
+        self._critic_frames = 0  # for which the critic alone learns
         self._recorded: graphs.Recorded | None = None
 
     def use_graphs(self) -> None:
         """Take gradient steps as replays of a CUDA graph from now on."""
         optimizers = list(self.optimizers.values())
         self._recorded = graphs.gradient_step(self._step, self._networks, optimizers, "the gradient step")
+
+    def begin_with(self, policy: Mapping[str, Tensor] | None, critic_frames: int) -> None:
+        """Begin with a trained policy's parameters, and let the critic alone learn from the first frames.
+
+        Args:
+            policy: state of ``self.policy`` to begin with; None: it stays as it is.
+            critic_frames: until so many frames have been stored, the learning rates of all else are 0.
+        """
+        if policy is not None:
+            self.policy.load_state_dict(policy)
+            # made anew, it begins with targets that are what they follow
+            self.target_update = FusedSoftUpdate(self.loss, tau=self.config.tau)
+        self._critic_frames = critic_frames
+        self._let_actor_learn()
+
+    def _let_actor_learn(self) -> None:
+        """Set the learning rates of all but the critic, a temperature's too, to 0 or to the settings' own."""
+        learns = self.frames >= self._critic_frames
+        for name, optimizer in self.optimizers.items():
+            if name != "critic":
+                graphs.set_lr(optimizer, self._lr[name] * learns)
 
     def _networks(self) -> list[Tensor]:
         """Networks and target networks."""
@@ -191,6 +214,8 @@ class OffPolicy:
         self.frames += batch.numel()
         steps = self._steps_for(batch.numel())
         self.policy.schedule(self.frames)
+        if self._critic_frames:
+            self._let_actor_learn()
         totals, step = None, self._recorded or self._step
         for _ in range(steps):
             metrics = step(self.sample())
@@ -235,6 +260,7 @@ class OffPolicy:
         self.frames, self._due = state["frames"], state["due"]
         if self._recorded is not None:  # the optimisers' tensors are others now
             self.use_graphs()
+        self._let_actor_learn()
         if "replay" in state:
             self.replay.load_state_dict(state["replay"])
         self.policy.schedule(self.frames)

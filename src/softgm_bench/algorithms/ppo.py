@@ -152,12 +152,25 @@ class PPO:
         self.critic_optimizer = torch.optim.Adam(self._critic_parameters, lr=config.critic_lr, eps=1e-5, fused=True)
         self.trained_frames = 0
         self._kl_scale = 1.0  # of the actor's learning rate
+        self._critic_frames = 0  # for which the actor waits
         self._recorded: graphs.Recorded | None = None
 
     def use_graphs(self) -> None:
         """Take gradient steps as replays of a CUDA graph from now on, those on minibatches of the usual size."""
         networks = [*self._actor_parameters, *self._critic_parameters]
         self._recorded = graphs.gradient_step(self._step, lambda: networks, self._optimizers, "PPO's gradient step")
+
+    def begin_with(self, policy: Mapping[str, Tensor] | None, critic_frames: int) -> None:
+        """Begin with a trained policy's parameters, and let the critic alone learn from the first frames.
+
+        Args:
+            policy: state of ``self.policy`` to begin with; None: it stays as it is.
+            critic_frames: until so many frames have been learnt from, the actor's learning rate is 0.
+        """
+        if policy is not None:
+            self.policy.load_state_dict(policy)
+        self._critic_frames = critic_frames
+        self._set_learning_rates()
 
     @property
     def _optimizers(self) -> tuple[torch.optim.Optimizer, torch.optim.Optimizer]:
@@ -296,7 +309,8 @@ class PPO:
         config, left = self.config, 1.0
         if config.lr_schedule == "linear":
             left = max(0.0, 1.0 - self.trained_frames / config.lr_schedule_frames)
-        return config.actor_lr * self._kl_scale * left, config.critic_lr * left
+        acts = self.trained_frames >= self._critic_frames
+        return config.actor_lr * self._kl_scale * left * acts, config.critic_lr * left
 
     def _set_learning_rates(self) -> None:
         for optimizer, lr in zip(self._optimizers, self._learning_rates, strict=True):

@@ -15,6 +15,8 @@ class Algorithm(Protocol):
     """The interface of an algorithm for the loop of a run.
 
     One that also has ``use_graphs()`` is asked to record its gradient steps as CUDA graphs where the settings say so.
+    One that also has ``begin_with(policy, critic_frames)`` can begin with a trained policy's parameters and hold the
+    actor still until its critic has learnt from so many frames; ``policy`` is None where a run is resumed.
     One that also has ``update_mixture(batches)`` can learn from arms of several numbers of sections, from a batch of
     each at once; its parameters must not depend on that number.
 

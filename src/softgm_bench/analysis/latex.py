@@ -49,6 +49,7 @@ SYMBOLS = {
     "‡": r"$^{\ddagger}$",
     "§": r"$^{\mathsection}$",
     "¶": r"$^{\mathparagraph}$",
+    "‖": r"$^{\|}$",
     "√": r"$\surd$",
     "τ": r"$\tau$",
     "→": r"$\rightarrow$",

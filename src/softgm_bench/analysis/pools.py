@@ -9,14 +9,15 @@ from softgm_bench.analysis import paper
 from softgm_bench.analysis.runs import TUNED, Evaluation, Run
 from softgm_bench.analysis.statistics import Array, Bootstrap, Scores, mean
 
-ORACLE, CURRICULUM, PERTURBED, SMOKE = "†", "‡", "§", "¶"
+ORACLE, CURRICULUM, PERTURBED, SMOKE, STARTED = "†", "‡", "§", "¶", "‖"
 MARKS = {
     ORACLE: "actors were told what they would have to discover; whether they use it, interventions tell",
     CURRICULUM: "trained with easier scenes first; evaluated, as all are, on the task itself",
     PERTURBED: "trained and evaluated under a perturbation, or with a body drawn for every episode",
     SMOKE: "of smoke size: every part of a training once, which teaches nothing",
+    STARTED: "begun with a trained policy, whose frames are not counted",
 }
-UNRANKED = {ORACLE, PERTURBED, SMOKE}
+UNRANKED = {ORACLE, PERTURBED, SMOKE, STARTED}
 SEEDS = 3  # that an algorithm needs to be compared with another
 ROUNDING = 1.02  # of the most frames to the fewest that count as equal: trainings end with a whole iteration
 
@@ -155,8 +156,9 @@ def by_algorithm(runs: Sequence[Run]) -> dict[tuple[str, str], list[Run]]:
 def pool_runs(runs: Sequence[Run]) -> dict[tuple[str, str], Pool]:
     """Pool final evaluations by task and algorithm; algorithms that differ in kind have different names.
 
-    Ranked are runs of more than smoke size, with the tuned recipe, without the oracle, perturbation and drawn bodies.
-    Where some of them were trained with a curriculum and others were not, those with it are not ranked.
+    Ranked are runs of more than smoke size, with the tuned recipe, without the oracle, perturbation, drawn bodies and
+    a trained policy to begin with. Where some of them were trained with a curriculum and others were not, those with
+    it are not ranked.
     """
     pools = {}
     for key, members in by_algorithm(sorted(runs, key=lambda run: (run.final.seed, run.final.folder))).items():
@@ -172,7 +174,13 @@ def pool_runs(runs: Sequence[Run]) -> dict[tuple[str, str], Pool]:
 
 def _kinds(run: Run) -> set[str]:
     perturbed = run.trained_with != "none" or run.randomised
-    there = {ORACLE: run.oracle, CURRICULUM: run.curriculum, PERTURBED: perturbed, SMOKE: run.smoke}
+    there = {
+        ORACLE: run.oracle,
+        CURRICULUM: run.curriculum,
+        PERTURBED: perturbed,
+        SMOKE: run.smoke,
+        STARTED: run.started,
+    }
     return {mark for mark, is_so in there.items() if is_so}
 
 

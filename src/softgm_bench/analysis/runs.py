@@ -108,6 +108,11 @@ class Run:
         return (self.config.get("randomise") or {}).get("name", "none") != "none"
 
     @property
+    def started(self) -> bool:
+        """Tell whether training began with a trained policy."""
+        return (self.config.get("start") or {}).get("policy") is not None
+
+    @property
     def recipe(self) -> str:
         """Name of the hyperparameters."""
         return _recipe(self.config)

@@ -35,6 +35,8 @@ def validate(config: Config) -> None:
             raise UserError(f"{key}={value}: it must be at least 1")
     if experiment.minutes is not None and not experiment.minutes > 0.0:
         raise UserError(f"experiment.minutes={experiment.minutes}: it must be above 0, or null")
+    if config.start.critic_frames < 0:
+        raise UserError(f"start.critic_frames={config.start.critic_frames}: it must not be negative")
     if not config.run_dir:
         raise UserError("run_dir is empty: name a folder for the run")
     if config.observation not in OBSERVATIONS:

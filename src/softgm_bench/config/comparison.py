@@ -36,6 +36,11 @@ def differences(
     return {key: found[key] for key in sorted(found, key=lambda key: (not key.endswith(".name"), key))}
 
 
+def as_written(value: Any) -> str:
+    """A setting's value as the command line has it."""
+    return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+
+
 def _compare(
     wanted: Mapping[str, Any], held: Mapping[str, Any], free: set[str], prefix: str
 ) -> Iterator[tuple[str, tuple[Any, Any]]]:

@@ -48,6 +48,11 @@ def if_mixture(mixture: Any, one: Any, *, _root_: DictConfig) -> Any:
     return _node(mixture if OmegaConf.is_list(OmegaConf.select(_root_, "task.n_agents")) else one)
 
 
+def if_started(started: Any, fresh: Any, *, _root_: DictConfig) -> Any:
+    """The first value where training begins with a trained policy (``start.policy``), the second elsewhere."""
+    return _node(fresh if OmegaConf.select(_root_, "start.policy") is None else started)
+
+
 def in_smoke(smoke: Any, otherwise: Any, *, _root_: DictConfig) -> Any:
     """The first value with ``experiment=smoke``, the second with every other experiment."""
     return _node(smoke if OmegaConf.select(_root_, "experiment.name") == SMOKE else otherwise)
@@ -67,7 +72,8 @@ def label(*, _root_: DictConfig) -> str:
     """Give the name of the results, ``Config.label``, for run folders."""
     cell = OmegaConf.select(_root_, "algo.actor.memory.cell")
     changed = (_root_.perturbation.name, _root_.randomise.name)
-    return labelled(_root_.algo.name, _root_.model.name, _root_.observation, *changed, cell)
+    started = OmegaConf.select(_root_, "start.policy") is not None
+    return labelled(_root_.algo.name, _root_.model.name, _root_.observation, *changed, cell, started)
 
 
 def _node(value: Any) -> Any:
@@ -77,6 +83,6 @@ def _node(value: Any) -> Any:
 
 def register() -> None:
     """Let YAML call the functions above by their names."""
-    by_kind = (tuned_or_paper, on_or_off_policy, if_centralised, if_hidden, in_small_steps, if_mixture)
+    by_kind = (tuned_or_paper, on_or_off_policy, if_centralised, if_hidden, in_small_steps, if_mixture, if_started)
     for resolver in (*by_kind, in_smoke, in_gpu, first, label):
         OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)

@@ -53,6 +53,14 @@ class ExperimentConfig:
 
 
 @dataclass
+class StartConfig:
+    """Which trained policy training begins with, if any; see ``conf/config.yaml``."""
+
+    policy: str | None
+    critic_frames: int
+
+
+@dataclass
 class Config:
     """Everything that a run depends on; see ``conf/config.yaml``.
 
@@ -64,6 +72,7 @@ class Config:
     recipe: str
     seed: int
     observation: str
+    start: StartConfig
     device: str
     backend: str | None
     dtype: str
@@ -103,13 +112,20 @@ class Config:
         memory = getattr(getattr(self.algo, "actor", None), "memory", None)
         cell = None if memory is None else memory.cell
         changed = (self.perturbation.name, self.randomise.name)
-        return labelled(self.algo.name, model_name(self.model), self.observation, *changed, cell)
+        started = self.start.policy is not None
+        return labelled(self.algo.name, model_name(self.model), self.observation, *changed, cell, started)
 
 
 def labelled(
-    algo: str, model: str, observation: str, perturbation: str, randomise: str, memory: str | None = None
+    algo: str,
+    model: str,
+    observation: str,
+    perturbation: str,
+    randomise: str,
+    memory: str | None = None,
+    started: bool = False,
 ) -> str:
-    """``algo``, and whatever in model, memory, observation, perturbation and bodies makes its results another kind's.
+    """``algo``, and whatever in model, memory, observation, perturbation, bodies, start makes results another kind's.
 
     SoftGM has the model that it is named after, the other algorithms an MLP; any other is named. A model whose name
     begins with the algorithm's, such as an ablation's, names both.
@@ -118,7 +134,15 @@ def labelled(
     if model.startswith(f"{algo}_"):
         algo, own = model, model
     bodies = "none" if randomise == "none" else f"randomised_{randomise}"
-    usual = ((own, model), (None, memory), ("standard", observation), ("none", perturbation), ("none", bodies))
+    start = "started" if started else None
+    usual = (
+        (own, model),
+        (None, memory),
+        ("standard", observation),
+        ("none", perturbation),
+        ("none", bodies),
+        (None, start),
+    )
     return "_".join([algo, *(value for default, value in usual if value is not None and value != default)])
 
 

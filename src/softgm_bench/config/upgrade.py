@@ -10,6 +10,8 @@ NEUTRAL: dict[str, Any] = {
     "resume": False,
     "compile": None,
     "matmul": None,
+    "start.policy": None,
+    "start.critic_frames": 0,
     "experiment.name": "",
     "experiment.minutes": None,
     "task.train_horizon": None,

@@ -68,7 +68,7 @@ def write(run: Run, folder: RunFolder, records: EpisodeRecords) -> dict[str, Any
         "deterministic": config.experiment.evaluation.deterministic,
         "final_evaluation": summarise(records),
         "versions": versions(),
-    }
+    } | ({} if run.start is None else {"start": run.start})
     write_atomically(folder.summary, (to_json(summary, indent=2) + "\n").encode())
     return summary
 

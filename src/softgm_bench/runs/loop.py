@@ -19,7 +19,7 @@ from softgm_bench.envs.section_mixture import numbers_of
 from softgm_bench.episodes.evaluation import EpisodeRecords
 from softgm_bench.episodes.summary import summarise, table
 from softgm_bench.errors import NotFinite, UserError
-from softgm_bench.runs import checkpoint, divergence, ending, folder, resume
+from softgm_bench.runs import checkpoint, divergence, ending, folder, resume, start
 from softgm_bench.runs.budget import Budget
 from softgm_bench.runs.interruption import Interrupted, Interruption
 from softgm_bench.runs.loggers.guarded import Loggers, refuse_missing
@@ -138,6 +138,7 @@ def _begin(run: Run) -> None:
     """Make the run's folder, or resume the run in it."""
     config = run.config
     state = resume.newest_state(config) if config.resume else None
+    start.begin(run, resumed=state is not None)
     if state is None:
         folder.create(config.run_dir, plain(config), config.overwrite or config.resume)
     else:

@@ -13,7 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from yaml import YAMLError
 
 from softgm_bench.config import Config, plain, typed
-from softgm_bench.config.comparison import ABSENT, differences
+from softgm_bench.config.comparison import ABSENT, as_written, differences
 from softgm_bench.config.explain import USER_ERRORS
 from softgm_bench.errors import UserError
 from softgm_bench.models.finite import not_finite
@@ -117,14 +117,9 @@ def _refuse_other_settings(config: Config, folder: RunFolder) -> None:
         now, then = (None if value is ABSENT else value for value in pair)
         if now != then:
             raise UserError(
-                f"{key}={_written(now)}: the run in {folder.path} has {_written(then)}; "
+                f"{key}={as_written(now)}: the run in {folder.path} has {as_written(then)}; "
                 "give that, or choose another run_dir"
             )
-
-
-def _written(value: Any) -> str:
-    """As it is written on the command line."""
-    return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def _say(line: str) -> None:

@@ -37,6 +37,7 @@ class Run:
         budget: of this process's time.
         frames: control steps of single environments that the policy has learnt from.
         evaluations: made so far.
+        start: the policy that it began with: ``policy`` as it was named, ``fingerprint``, ``frames``; None: with none.
     """
 
     config: Config
@@ -51,6 +52,7 @@ class Run:
     iteration: int = 0
     frames: int = 0
     evaluations: int = 0
+    start: dict[str, Any] | None = None
     loggers: Loggers = field(init=False)
 
     @property
@@ -75,6 +77,7 @@ class Run:
             },
             "episodes": self.episodes.state_dict(),
             "counters": {"iteration": self.iteration, "evaluations": self.evaluations, "wall_time": self.wall_time},
+            "start": self.start,
             "policy": self.algorithm.policy.state_dict(),
             "sizes": asdict(self.env.sizes),
             "config": plain(self.config),
@@ -91,7 +94,7 @@ class Run:
         self.collector.show(environment["shown"])
         self.episodes.load_state_dict(state["episodes"])
         self.iteration, self.evaluations = counters["iteration"], counters["evaluations"]
-        self.frames = state["frames"]
+        self.frames, self.start = state["frames"], state.get("start")
         self.started -= counters["wall_time"]
         checkpoint.set_random_state(state["random"])  # last: nothing draws any more
 
