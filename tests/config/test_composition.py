@@ -110,3 +110,12 @@ def test_a_part_of_a_policys_settings_is_replaced_by_what_the_runs_recipe_has():
         run = plain(compose([f"recipe={recipe}"]))
         assert changed(run, ["task=wall"]).task.curriculum.enabled is enabled
     assert changed(run | {"recipe": ""}, ["task=wall", "task.slots=7"]).task.slots == 7
+
+
+@pytest.mark.parametrize("limit", ["null", "3", "80"])
+def test_a_policy_plays_by_any_limit_of_contact_whatever_its_curriculum_had(limit):
+    eased = ("task.max_contact_steps=0", "task.curriculum.easy_contact_steps=50", "task.curriculum.contact_stages=2")
+    run = plain(compose(["task=wall", *eased]))
+    found = changed(run, [f"task.max_contact_steps={limit}"]).task.max_contact_steps
+    assert found == (None if limit == "null" else int(limit))
+    assert changed(run, ["task.slots=7"]).task.curriculum.easy_contact_steps == 50

@@ -29,6 +29,8 @@ from softgm_bench.rod.parameters import RodParameters
 # chosen by name, which trained policies can be evaluated with others of
 GROUPS = ("task", "rod", "perturbation", "randomise")
 CHANGEABLE = (*GROUPS, "backend", "dtype")
+# A curriculum's limit of contact must fit the task's; where a policy plays by another limit there is no curriculum.
+NO_EASIER_CONTACT = ("task.curriculum.easy_contact_steps=null", "task.curriculum.contact_stages=0")
 
 resolvers.register()
 
@@ -153,6 +155,8 @@ def changed(values: Mapping[str, Any], overrides: Sequence[str]) -> Config:
             settings[key] = chosen[key]
         else:
             raise UserError(f"{override}: name one of the files in conf/{key}")
+    if any(override.startswith("task.max_contact_steps=") for override in single):
+        single = [*NO_EASIER_CONTACT, *single]
     try:
         return typed(OmegaConf.merge(settings, OmegaConf.from_dotlist(single)))  # type: ignore[arg-type]
     except YAMLError as error:
