@@ -71,3 +71,11 @@ def test_discoveries_are_rewarded_one_by_one_up_to_the_cap():
 
 def test_success_pays_once_it_is_true():
     assert terms(success=True)["success"] == 50.0
+
+
+def test_a_step_in_which_an_obstacle_pushes_costs_as_contact_does():
+    """Where pushes are counted, no node need touch at the step's end."""
+    unseen = terms(contact_nodes=0, pushed=True, previous_distance=0.40)
+    assert unseen["collision"] == pytest.approx(-0.01)
+    assert unseen["stuck"] == pytest.approx(-0.05)
+    assert terms(pushed=True) == terms(pushed=False) == terms()

@@ -95,7 +95,8 @@ def make_judge(n_nodes: int, n_agents: int, real: type) -> Callable[..., Any]:
             for k in range(n_nodes):
                 contacts += 1 if touching[b, k] else 0
             clocks[0, b] = steps[b] + (1 if active else 0)
-            clocks[1, b] = contact_steps[b] + (1 if active and (contacts > 0 or pushed[b]) else 0)
+            in_contact = contacts > 0 or pushed[b]
+            clocks[1, b] = contact_steps[b] + (1 if active and in_contact else 0)
             failure = active and limit >= 0 and clocks[1, b] > limit
             success = distance < c.success_radius and not broken[b] and not failure
             over = terminated[b] or (active and (success or broken[b] or failure))
@@ -106,7 +107,7 @@ def make_judge(n_nodes: int, n_agents: int, real: type) -> Callable[..., Any]:
             numbers[3, b], numbers[4, b] = torques(c, action[b])
             change = effort_change(action[b], previous_action[b])
             progress = tip_to(before[b], target[b]) - distance
-            reward(c, numbers[5:, b], distance, progress, change, contacts, new_bins[b], success, failure)
+            reward(c, numbers[5:, b], distance, progress, change, contacts, in_contact, new_bins[b], success, failure)
 
     callees = {
         "tip_to": device(_make_tip_to(n_nodes, real)),
@@ -173,9 +174,9 @@ def _make_effort_change(n_agents: int, real: type) -> Callable[..., Any]:
 def _make_reward(real: type) -> Callable[..., Any]:
     zero, one = real(0.0), real(1.0)
 
-    def reward(c, out, distance, progress, change, contacts, new_bins, success, failure):
+    def reward(c, out, distance, progress, change, contacts, in_contact, new_bins, success, failure):
         """The reward, and behind it its terms as in ``reward.reward_terms``."""
-        touching = one if contacts > 0 else zero
+        touching = one if in_contact else zero
         still = one if abs(progress) < c.epsilon else zero
         found = real(new_bins)
         found = c.k_max if c.k_max < found else found

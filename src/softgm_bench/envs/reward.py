@@ -16,6 +16,7 @@ def reward_terms(
     new_bins: Tensor,
     success: Tensor,
     contact_failure: Tensor | None = None,
+    pushed: Tensor | None = None,
 ) -> dict[str, Tensor]:
     """All terms with their signs, so that the reward is their sum.
 
@@ -29,12 +30,15 @@ def reward_terms(
         new_bins: N_t^new, bins discovered in this step, ``(num_envs,)``.
         success: d_t below the success radius, ``(num_envs,)`` bool.
         contact_failure: whether too much contact has ended the episode, ``(num_envs,)`` bool; None: it cannot.
+        pushed: whether an obstacle pushed the arm within the step, which is contact too, ``(num_envs,)`` bool; None:
+            nodes in contact alone count (the paper).
 
     Returns:
         Terms by the names in ``entries.REWARD_TERM_NAMES``, ``(num_envs,)`` each.
     """
     progress = previous_distance - distance
-    touching = (contact_nodes > 0).to(distance.dtype)
+    in_contact = contact_nodes > 0 if pushed is None else (contact_nodes > 0) | pushed
+    touching = in_contact.to(distance.dtype)
     still = (progress.abs() < config.epsilon).to(distance.dtype)
     collision = config.lambda_c * touching + config.lambda_cn * contact_nodes
     if contact_failure is not None:

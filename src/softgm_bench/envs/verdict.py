@@ -132,6 +132,7 @@ def judge_dense(step: Step, config: TaskConfig, horizon: int) -> Verdict:
         new_bins=step.new_bins,
         success=success,
         contact_failure=too_much,
+        pushed=step.pushed,
     )
     torque = config.actuation.max_torque * step.action
     numbers = (
