@@ -52,6 +52,13 @@ def test_what_came_later_is_free_unless_it_changes_numbers():
     networks |= {"start.policy", "start.critic_frames"}
     surfaces = {f"task.{name}_coefficient" for name in ("friction", "velocity_damping")}
     tasks = surfaces | {"task.max_contact_steps", "task.contact_counts", "task.reward.lambda_fail"}
-    eased = ("easier_share", "easy_contact_steps", "contact_stages", "easy_target_offset", "target_power")
+    eased = (
+        "easier_share",
+        "easy_contact_steps",
+        "contact_stages",
+        "easy_lambda_c",
+        "easy_target_offset",
+        "target_power",
+    )
     tasks |= {f"task.curriculum.{name}" for name in eased}
     assert set(NEUTRAL) - set(FREE) == networks | tasks

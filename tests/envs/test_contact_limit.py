@@ -89,6 +89,27 @@ def test_easier_scenes_allow_more_contact_and_the_tasks_own_no_more_than_the_tas
         assert failed[:, row].nonzero().flatten().tolist() == [last]
 
 
+@pytest.mark.parametrize("dense", [False, True], ids=["rows", "all rows"])
+@pytest.mark.parametrize("stage", [0, 2, 4])
+def test_a_step_in_contact_costs_less_in_easier_scenes_and_nothing_else_does(limited, settings, stage, dense):
+    """As if the whole run had the cost of the stage."""
+    task = settings("task=wall_touch", "task.curriculum.enabled=true", "task.curriculum.stages=4").task
+    waiving = dataclasses.replace(task.curriculum, easy_lambda_c=-1.0)
+    played = []
+    for curriculum, cost in ((waiving, -5.0), (task.curriculum, -1.0 - stage)):
+        changes = {"curriculum": curriculum, "reward": dataclasses.replace(task.reward, lambda_c=cost)}
+        env = limited(2, task=changes, curriculum=True)
+        state = env.simulation_state()
+        state["progress", "stage"].fill_(stage)
+        env.load_simulation_state(state)
+        with force_dense() if dense else nullcontext():
+            played.append(pressing(env, 40))
+    assert any((frame[entries.CONTACT_NODES] > 0.0).any() for frame in played[0])
+    for waived, dear in zip(*played, strict=True):
+        for key in (entries.REWARD, *((entries.REWARD_TERMS, name) for name in entries.REWARD_TERM_NAMES)):
+            torch.testing.assert_close(waived[key], dear[key], rtol=1e-5, atol=1e-5)
+
+
 def test_evaluations_allow_what_the_task_does_whatever_training_began_with(eased):
     env = eased(False)
     assert not env.simulator.state.episodes.contact_steps.any()

@@ -12,7 +12,14 @@ from hypothesis import strategies as st
 from dense import force_dense
 from every_task import TASKS
 from softgm_bench.assembly import configure
-from softgm_bench.envs.curriculum import difficulty, first_progress, further_contact, note_ends, scene_difficulty
+from softgm_bench.envs.curriculum import (
+    difficulty,
+    first_progress,
+    further_contact,
+    note_ends,
+    scene_difficulty,
+    waived_cost,
+)
 from softgm_bench.envs.tasks import make_task
 from softgm_bench.envs.tasks.base import CurriculumConfig, eased
 from softgm_bench.errors import UserError
@@ -27,6 +34,7 @@ FOUR = CurriculumConfig(
     easier_share=0.0,
     easy_contact_steps=None,
     contact_stages=0,
+    easy_lambda_c=None,
 )
 
 
@@ -342,6 +350,18 @@ def test_the_last_stages_lower_the_limit_of_contact_alone_where_the_settings_say
     assert left == 0
 
 
+@pytest.mark.parametrize("last", [0, 2])
+def test_what_contact_costs_rises_to_the_tasks_own_with_what_it_is_limited_to(last):
+    task = configure(["task=wall_touch", ENABLED, "task.reward.lambda_c=-5"]).task
+    curriculum = dataclasses.replace(task.curriculum, stages=4, contact_stages=last, easy_contact_steps=110)
+    assert waived_cost(level(0.5), dataclasses.replace(task, curriculum=curriculum)) is None
+    task = dataclasses.replace(task, curriculum=dataclasses.replace(curriculum, easy_lambda_c=-1.0))
+    for stage in range(5):
+        now = level(stage / 4)
+        assert waived_cost(now, task).item() == pytest.approx(4.0 * further_contact(now, task).item() / 100, abs=0.021)
+    assert waived_cost(level(1.0), task) == 0.0
+
+
 @pytest.mark.parametrize(
     ("override", "message"),
     [
@@ -362,6 +382,10 @@ def test_the_last_stages_lower_the_limit_of_contact_alone_where_the_settings_say
         ),
         ("task.curriculum.contact_stages=-1", r"task.curriculum.contact_stages is -1"),
         ("task.curriculum.contact_stages=4", r"contact_stages is 4: without task.curriculum.easy_contact_steps"),
+        (
+            "task.curriculum.easy_lambda_c=-0.5",
+            r"task.curriculum.easy_lambda_c is -0.5, task.reward.lambda_c -0.01: contact costs no more",
+        ),
         ("task.curriculum.easy_opening_side=0.2", r"task.curriculum.easy_opening_side is 0.2"),
         ("task.curriculum.easy_target_offset=1.5", r"task.curriculum.easy_target_offset is 1.5: it must lie between"),
         ("task.curriculum.target_power=0.0", r"task.curriculum.target_power is 0.0: it must be above 0"),

@@ -24,6 +24,7 @@ NEUTRAL: dict[str, Any] = {
     "task.curriculum.easier_share": 0.0,
     "task.curriculum.easy_contact_steps": None,
     "task.curriculum.contact_stages": 0,
+    "task.curriculum.easy_lambda_c": None,
     "task.curriculum.easy_target_offset": 0.0,
     "task.curriculum.target_power": 1.0,
     "algo.actor.embedding_norm": False,

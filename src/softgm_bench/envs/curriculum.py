@@ -71,8 +71,21 @@ def further_contact(level: Tensor, config: TaskConfig) -> Tensor | None:
     easy = settings.easy_contact_steps
     if easy is None or own is None:
         return None
-    left = (1.0 - level) * (settings.stages / (settings.contact_stages or settings.stages))
-    return ((easy - own) * left.clamp(max=1.0)).round().to(torch.int64)
+    return ((easy - own) * _leniency(level, settings)).round().to(torch.int64)
+
+
+def waived_cost(level: Tensor, config: TaskConfig) -> Tensor | None:
+    """Give by how much a step in contact costs less than the task's ``lambda_c`` has it; None: never any less.
+
+    It falls to 0 as ``further_contact`` does, in the precision of ``level``.
+    """
+    own, easy = config.reward.lambda_c, config.curriculum.easy_lambda_c
+    return None if easy is None else (easy - own) * _leniency(level, config.curriculum)
+
+
+def _leniency(level: Tensor, config: CurriculumConfig) -> Tensor:
+    """Fall from 1 to 0 with the difficulty: over all stages, or over the last ``contact_stages``."""
+    return ((1.0 - level) * (config.stages / (config.contact_stages or config.stages))).clamp(max=1.0)
 
 
 def leading(num_envs: int, config: CurriculumConfig) -> int:

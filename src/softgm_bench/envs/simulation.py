@@ -24,6 +24,7 @@ from softgm_bench.envs.curriculum import (
     leading,
     note_ends,
     scene_difficulty,
+    waived_cost,
 )
 from softgm_bench.envs.perturbation import Perturbation, PerturbationConfig
 from softgm_bench.envs.sensing import Bins, Sight, SlotTable, bins_per_cylinder, cut_into_bins, empty_table, look
@@ -407,8 +408,19 @@ class Simulator:
         now.steps, now.terminated, now.truncated = verdict.steps, verdict.terminated, verdict.truncated
         now.contact_steps = verdict.contact_steps
         if self.curriculum:
+            self._waive(verdict, pushed)
             state.progress = note_ends(state.progress, verdict.ended, verdict.success, config.curriculum)
         return Outcome(sight=sight, broken=broken, verdict=verdict)
+
+    def _waive(self, verdict: Verdict, pushed: Tensor) -> None:
+        """Take back from the reward what contact costs less at the difficulty of each episode."""
+        waived = waived_cost(self.state.episodes.difficulty, self.task.config)
+        if waived is None:
+            return
+        in_contact = (verdict.numbers[entries.CONTACT_NODES].view_as(pushed) > 0) | pushed
+        for key in (entries.REWARD, (entries.REWARD_TERMS, "collision")):
+            charged = verdict.numbers[key]
+            verdict.numbers[key] = charged + (waived * in_contact).to(charged.dtype).view_as(charged)
 
     def _move_cylinders(self, episodes: Episodes, active: Tensor) -> Tensor:
         """Bring the scenes of active environments to the end of this control step; bins keep their numbers.

@@ -64,6 +64,7 @@ class CurriculumConfig:
     easier_share: float
     easy_contact_steps: int | None
     contact_stages: int
+    easy_lambda_c: float | None
 
     def __post_init__(self) -> None:
         """Refuse values by which nothing could be decided.
@@ -86,10 +87,10 @@ class CurriculumConfig:
                 f"task.curriculum.contact_stages is {self.contact_stages}: "
                 f"it must be at least 0 and below task.curriculum.stages, {self.stages}"
             )
-        if self.contact_stages and self.easy_contact_steps is None:
+        if self.contact_stages and self.easy_contact_steps is None and self.easy_lambda_c is None:
             raise ValueError(
                 f"task.curriculum.contact_stages is {self.contact_stages}: without task.curriculum.easy_contact_steps "
-                "nothing would change in these stages; it must be 0"
+                "or easy_lambda_c nothing would change in these stages; it must be 0"
             )
 
 
@@ -143,6 +144,12 @@ class TaskConfig:
             raise ValueError(
                 f"task.curriculum.easy_contact_steps is {easy}, task.max_contact_steps {own}: "
                 "the easiest scenes allow no less contact than the task, whose limit must be a number; null: as much"
+            )
+        cost, easy_cost = self.reward.lambda_c, self.curriculum.easy_lambda_c
+        if easy_cost is not None and easy_cost < cost:
+            raise ValueError(
+                f"task.curriculum.easy_lambda_c is {easy_cost}, task.reward.lambda_c {cost}: "
+                "contact costs no more in the easiest scenes than in the task's own; null: as much"
             )
         for name in ("friction_coefficient", "velocity_damping_coefficient"):
             value = getattr(self, name)
