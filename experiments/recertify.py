@@ -3,23 +3,27 @@
 What ``softgm-bench certify`` finds makes the share of the certified scenes of every earlier evaluation another one.
 This rewrites, in the evaluations below ``experiments`` that have played certified scenes, the column ``certified`` of
 ``episodes.csv`` and ``success_certified`` of ``summary.json`` as the evaluation would write them today. No episode is
-played, and nothing else changes.
+played, and nothing else changes. An evaluation of a run whose settings let an arm touch more, or less, than the scenes
+were certified for keeps what it has.
 """
 
 import csv
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
+from omegaconf import DictConfig, OmegaConf
 
+from softgm_bench.config import typed
 from softgm_bench.episodes import certified
 from softgm_bench.episodes.evaluation import CERTIFIED, EpisodeRecords
 from softgm_bench.episodes.summary import summarise
 from softgm_bench.storage.files import to_json, write_atomically
 
 EXPERIMENTS = Path(__file__).parent
+RULES = ("max_contact_steps", "contact_counts")
 
 
 def marked(folder: Path) -> tuple[list[dict[str, str]], dict[str, Any]]:
@@ -43,10 +47,21 @@ def marked(folder: Path) -> tuple[list[dict[str, str]], dict[str, Any]]:
 
 
 def evaluations() -> Iterator[Path]:
-    """Go through the folders of all evaluations that have played certified scenes."""
+    """Go through the folders of all evaluations that have played certified scenes by the rules of the task."""
     for path in sorted(EXPERIMENTS.rglob("summary.json")):
-        if "success_certified" in json.loads(path.read_text()).get("metrics", {}):
+        summary = json.loads(path.read_text())
+        if "success_certified" in summary.get("metrics", {}) and by_its_rules(path.parent, summary["task"]):
             yield path.parent
+
+
+def by_its_rules(folder: Path, task: str) -> bool:
+    """Tell whether the run that an evaluation lies in, if it lies in one, limited contact as the task's scenes do."""
+    runs = [parent / "config.yaml" for parent in folder.parents if (parent / "config.yaml").exists()]
+    known = certified.of_task(task)
+    if not runs or known is None:
+        return True
+    held = typed(cast(DictConfig, OmegaConf.load(runs[0]))).task
+    return all(getattr(held, name) == known.physics["task"][name] for name in RULES)
 
 
 def main() -> None:
