@@ -372,3 +372,52 @@ def test_what_is_said_of_knowing_is_what_the_trials_hold(name, results):
         own, others = (f"{scene.mean():.3f}" for scene in scenes)
         told = f"{others} instead of {own} of 256 scenes ({split.lost} lost, {split.won} won"
         assert told in " ".join(page.split())
+
+
+def test_the_table_of_pushes_is_that_of_the_committed_figures_of_the_kept_policies(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "experiments")
+    pushes = script(ROOT / "experiments" / "pushes.py")
+    text = pushes.PAGE.read_text()
+    assert pushes.page(text) == text
+    held = {figures["name"]: figures for figures in map(json.loads, map(Path.read_text, pushes.FOLDER.glob("*.json")))}
+    assert held.keys() == pushes.POLICIES.keys()
+    for name, path in pushes.POLICIES.items():
+        assert held[name]["parameters"] == policy.fingerprint(policy.load(path))
+        assert len(held[name]["shares"]) == len(pushes.COLUMNS)
+
+
+def test_what_is_said_of_a_price_of_contact_is_what_its_trials_hold(results):
+    page = " ".join(CHOOSING.read_text().partition("## A price")[2].split())
+    names = ("limit_seed0", "limit_seed1", "dear_seed0", "price_seed0")
+    limit, other, dear, price = (ROOT / "experiments/trials/wall_sense" / name for name in names)
+    metrics = rows(limit / "metrics.csv")
+    frames = np.array([int(row["frames"]) for row in metrics])
+    left = np.array([60.0 * (1.0 - float(row["difficulty"])) for row in metrics])  # one step a stage
+    chosen = frames[left < 50.0 - 0.1][0] / 1e6
+    at = left[frames == 1_401_600].item()
+    assert f"seed 0 chooses after {chosen:.2f} million frames, has {at:.0f} steps in contact left after 1.40" in page
+    assert f"{left[-1]:.0f} when it was stopped after {millions(limit)} million." in page
+    assert f"was stopped after {millions(other)} million before" in page
+    assert min(60.0 * (1.0 - float(row["difficulty"])) for row in rows(other / "metrics.csv")) > 50.0 - 0.1
+    assert f"after {millions(dear)} million frames no episode of its last 20 iterations" in page
+    assert not any(float(row["success_rate"]) for row in rows(dear / "metrics.csv")[-20:] if int(row["episodes"]))
+    for trial in (limit, other):
+        early = {row["frames"]: float(row["success_rate"]) for row in rows(trial / "metrics.csv")}
+        assert early["160000"] > 0.87
+    begun = OmegaConf.load(price / "config.yaml")
+    assert (begun.task.reward.lambda_c, begun.task.max_contact_steps) == (-4.0, 50)
+    assert not begun.task.curriculum.enabled
+    told = json.loads((price / "summary.json").read_text())["start"]
+    kept = policy.load(limit / "policy-1401600.pt")
+    assert told == {"policy": begun.start.policy, "fingerprint": policy.fingerprint(kept), "frames": kept.frames}
+    assert (ROOT / begun.start.policy) == limit / "policy-1401600.pt"
+    final = json.loads((price / "summary.json").read_text())["final_evaluation"]["success_rate"]
+    assert "at the end it succeeds in {mean:.3f} [{low:.3f}, {high:.3f}] of 1000".format(**final) in page.lower()
+    shown = results.episodes_in(price / "evaluations")
+    rates = "{none:.3f}, {blind:.3f} and {swap_obstacles:.3f} of the 500 scenes when shown"
+    assert rates.format(**{name: episodes["success"].mean() for name, episodes in shown.items()}) in page
+    assert f"If no push is allowed it has {shown['no_push']['success'].mean():.3f} of them" in page
+    known = {file.stem: json.loads(file.read_text())["shares"] for file in (ROOT / "experiments/pushes").glob("*.json")}
+    before, later, priced = (known[name] for name in sorted(known))
+    assert (before[2] - later[2], before[2] - priced[2]) == (1.0, 10.0)
+    assert priced[1] == 0.0 == priced[4]
