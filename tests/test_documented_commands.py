@@ -25,7 +25,7 @@ BLOCK = re.compile(r"^```(?:sh|bash)?\n(.*?)^```", re.MULTILINE | re.DOTALL)
 def lines(page):
     """The command lines of a page's blocks, without comments."""
     for block in BLOCK.findall(page.read_text()):
-        for line in block.splitlines():
+        for line in block.replace("\\\n", " ").splitlines():
             yield re.sub(r"(^|\s+)# .*$", "", line).strip()
 
 
