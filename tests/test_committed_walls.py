@@ -305,14 +305,21 @@ def test_how_often_a_wall_is_touched_on_the_way_is_what_the_committed_episodes_h
     assert row_of(CHOOSING.read_text(), name) == [f"{(touched <= steps).mean():.2f}" for steps in range(6)]
 
 
+def figures_of(made_by):
+    """Committed figures of a script that fills a table, by name, after the checks that all such scripts share."""
+    text = made_by.PAGE.read_text()
+    assert made_by.page(text) == text
+    held = {figures["name"]: figures for figures in map(json.loads, map(Path.read_text, made_by.FOLDER.glob("*.json")))}
+    for name, path in made_by.POLICIES.items():
+        assert held[name]["parameters"] == policy.fingerprint(policy.load(path))
+        assert len(held[name]["shares"]) == len(made_by.COLUMNS)
+    return held
+
+
 def test_the_table_of_sides_is_that_of_the_committed_figures_of_the_kept_policies():
     sides = script(ROOT / "experiments" / "sides.py")
-    text = sides.PAGE.read_text()
-    assert sides.page(text) == text
-    held = {figures["name"]: figures for figures in map(json.loads, map(Path.read_text, sides.FOLDER.glob("*.json")))}
+    held = figures_of(sides)
     assert held.keys() > sides.POLICIES.keys()
-    for name, path in sides.POLICIES.items():
-        assert held[name]["parameters"] == policy.fingerprint(policy.load(path))
     for figures in held.values():
         assert (figures["seed"], figures["episodes"]) == (sides.SEED, sides.EPISODES)
         assert len(figures["shares"]) == len(sides.COLUMNS)
@@ -321,15 +328,10 @@ def test_the_table_of_sides_is_that_of_the_committed_figures_of_the_kept_policie
 def test_the_table_of_touches_is_that_of_the_committed_figures_of_the_kept_policies(monkeypatch):
     monkeypatch.syspath_prepend(ROOT / "experiments")
     touches = script(ROOT / "experiments" / "touches.py")
-    text = touches.PAGE.read_text()
-    assert touches.page(text) == text
-    held = {figures["name"]: figures for figures in map(json.loads, map(Path.read_text, touches.FOLDER.glob("*.json")))}
+    held = figures_of(touches)
     assert held.keys() == touches.POLICIES.keys()
-    for name, path in touches.POLICIES.items():
-        assert held[name]["parameters"] == policy.fingerprint(policy.load(path))
-        assert len(held[name]["shares"]) == len(touches.COLUMNS)
     touch, blind_touch, eased, blind = (held[name]["shares"] for name in touches.POLICIES)
-    page = " ".join(text.split())
+    page = " ".join(CHOOSING.read_text().split())
     assert f"lean on the wall for {eased[2]:.0f} steps of an episode, the blind one for {blind[2]:.0f}.**" in page
     missed = (f"{shares[2] / shares[1]:.1f}" for shares in (touch, blind_touch))
     assert "arms are pushed in {} and {} times as many steps as are counted.".format(*missed) in page
@@ -377,13 +379,7 @@ def test_what_is_said_of_knowing_is_what_the_trials_hold(name, results):
 def test_the_table_of_pushes_is_that_of_the_committed_figures_of_the_kept_policies(monkeypatch):
     monkeypatch.syspath_prepend(ROOT / "experiments")
     pushes = script(ROOT / "experiments" / "pushes.py")
-    text = pushes.PAGE.read_text()
-    assert pushes.page(text) == text
-    held = {figures["name"]: figures for figures in map(json.loads, map(Path.read_text, pushes.FOLDER.glob("*.json")))}
-    assert held.keys() == pushes.POLICIES.keys()
-    for name, path in pushes.POLICIES.items():
-        assert held[name]["parameters"] == policy.fingerprint(policy.load(path))
-        assert len(held[name]["shares"]) == len(pushes.COLUMNS)
+    assert figures_of(pushes).keys() == pushes.POLICIES.keys()
 
 
 def test_what_is_said_of_a_price_of_contact_is_what_its_trials_hold(results):
@@ -407,11 +403,15 @@ def test_what_is_said_of_a_price_of_contact_is_what_its_trials_hold(results):
     begun = OmegaConf.load(price / "config.yaml")
     assert (begun.task.reward.lambda_c, begun.task.max_contact_steps) == (-4.0, 50)
     assert not begun.task.curriculum.enabled
-    told = json.loads((price / "summary.json").read_text())["start"]
+    summary = json.loads((price / "summary.json").read_text())
     kept = policy.load(limit / "policy-1401600.pt")
-    assert told == {"policy": begun.start.policy, "fingerprint": policy.fingerprint(kept), "frames": kept.frames}
+    assert summary["start"] == {
+        "policy": begun.start.policy,
+        "fingerprint": policy.fingerprint(kept),
+        "frames": kept.frames,
+    }
     assert (ROOT / begun.start.policy) == limit / "policy-1401600.pt"
-    final = json.loads((price / "summary.json").read_text())["final_evaluation"]["success_rate"]
+    final = summary["final_evaluation"]["success_rate"]
     assert "at the end it succeeds in {mean:.3f} [{low:.3f}, {high:.3f}] of 1000".format(**final) in page.lower()
     shown = results.episodes_in(price / "evaluations")
     rates = "{none:.3f}, {blind:.3f} and {swap_obstacles:.3f} of the 500 scenes when shown"

@@ -10,7 +10,7 @@ from softgm_bench.envs import make_env
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 FRAMES = 32  # of a batch: 4 environments, 8 steps
-PPO = ("algo.epochs=2", "algo.minibatch_size=16", "model.hidden=16")
+PPO = ("algo.epochs=2", "algo.minibatch_size=16")
 OFF_POLICY = ("algo.batch_size=16", "algo.replay_capacity=200", "algo.random_frames=0", "algo.updates_per_frame=0.1")
 CASES = {"softgm": PPO, "ippo": PPO, "maddpg": OFF_POLICY, "isac": OFF_POLICY}
 
@@ -18,8 +18,7 @@ CASES = {"softgm": PPO, "ippo": PPO, "maddpg": OFF_POLICY, "isac": OFF_POLICY}
 @pytest.fixture(params=CASES)
 def build(request, settings):
     def algorithm(seed):
-        extra = () if request.param == "softgm" else ("model.hidden=16",)
-        config = settings("task=basic", f"algo={request.param}", *CASES[request.param], *extra)
+        config = settings("task=basic", f"algo={request.param}", *CASES[request.param], "model.hidden=16")
         torch.manual_seed(seed)
         env = make_env(config.task, SHORT, num_envs=4, seed=0, horizon=7)
         return build_algorithm(config.algo, config.model, env), env

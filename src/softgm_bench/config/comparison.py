@@ -37,8 +37,8 @@ def differences(
 
 
 def as_written(value: Any) -> str:
-    """A setting's value as the command line has it."""
-    return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+    """A setting's value as the command line has it; ``null`` where there is none."""
+    return "null" if value is None or value is ABSENT else str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def _compare(

@@ -4,12 +4,12 @@ from pathlib import Path
 from typing import Any
 
 from softgm_bench.config import Config, plain
-from softgm_bench.config.comparison import ABSENT, as_written, differences
+from softgm_bench.config.comparison import as_written, differences
 from softgm_bench.episodes import policy
 from softgm_bench.errors import UserError
 from softgm_bench.runs.run import Run
 
-# What may differ: it says how the policy explores or where it is evaluated, not what its parameters mean.
+# What may differ: it says how widely the policy explores, not what its parameters mean.
 EXPLORATION = ("algo.actor.initial_sigma", "algo.actor.min_sigma", "algo.actor.max_sigma")
 
 
@@ -50,7 +50,7 @@ def refuse_other_networks(name: str, held: Config, config: Config) -> None:
     """
     wanted, there = (_networks(one) for one in (config, held))
     for key, pair in differences(wanted, there, EXPLORATION).items():
-        ours, theirs = (as_written(None if value is ABSENT else value) for value in pair)
+        ours, theirs = map(as_written, pair)
         raise UserError(f"start.policy={name}: it was trained with {key}={theirs}, which is {ours} here")
 
 
